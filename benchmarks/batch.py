@@ -71,7 +71,7 @@ def measure() -> list[Measurement]:
 
     # the best of several: what else the machine does only ever adds; the peer takes long enough to even it out
     ours, peer = min(_cpu_seconds(run_ours) for _ in range(ROUNDS)), _cpu_seconds(run_peer)
-    after = {name: group.standing(1).x[0, k] for group in run_ours() for name, k in group.index.items()}
+    after = {name: group.snapshot(1).x[0, k] for group in run_ours() for name, k in group.index.items()}
     states = [state.x for state in run_peer()]
     difference = max(
         float(np.abs(after[model.name] - state).max()) for model, state in zip(models, states, strict=True)

@@ -108,7 +108,7 @@ def _as_done_on_cores(
 
 
 def _until_one_dies(
-    work: Callable[[Item], Outcome], left: Iterator[tuple[int, Item]], jobs: int
+    work: Callable[[Item], Outcome], remaining: Iterator[tuple[int, Item]], jobs: int
 ) -> Generator[tuple[int, Outcome | Lost], None, list[tuple[int, Item]]]:
     """Yield `work` of the items. Return the items in progress when a process died, none if all are done."""
     from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
@@ -121,7 +121,7 @@ def _until_one_dies(
     )
     try:
         while not broken:
-            for item in islice(left, HANDED_OUT * jobs - len(under_way)):
+            for item in islice(remaining, HANDED_OUT * jobs - len(under_way)):
                 try:
                     under_way[executor.submit(_work_on, item[1])] = item
                 except BrokenProcessPool:

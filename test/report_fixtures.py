@@ -21,7 +21,7 @@ from dvl_calib_ros.calibration.results.extrinsics import Extrinsics
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.answer.gap_location import GapPlace
 from dvl_calib_ros.diagnosis.answer.noise_findings import NoiseFinding
-from dvl_calib_ros.diagnosis.answer.plotted_series import DiagnosisSeries, Followed
+from dvl_calib_ros.diagnosis.answer.plotted_series import DiagnosisSeries, RegressorPlot
 from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.evaluation.convergence import TIMES_S
@@ -180,7 +180,7 @@ def diagnosis(**changes: Any) -> Diagnosis:
         {"turning": turning, "straight": ~turning}, traces, np.deg2rad([1.0, -2.0, 3.0]), np.array([0.01, 0.0, -0.02]),
         np.array([*np.deg2rad([0.1, 0.2, 0.3]), 0.001, 0.002, 0.03]),
         Unexplained(-1.0, "turn rate", np.zeros((n, 3, 1)), np.zeros((n, 3, 0))),
-        followed=Followed("turn rate, °/s (to port)", "y", 5.0 * np.sin(time / 8.0), noise[:, 1]),
+        by_regressor=RegressorPlot("turn rate, °/s (to port)", "y", 5.0 * np.sin(time / 8.0), noise[:, 1]),
     )  # fmt: skip
     values: dict[str, Any] = {
         "verdict": DiagnosisVerdict.AMBIGUOUS,

@@ -86,16 +86,27 @@ def stamps_a_minute_and_a_half_ahead(told: Told, wrong: bool) -> None:
             message.header.stamp.sec += 90
 
 
-def one_beam_low(told: Told, wrong: bool) -> None:
-    """One of four beams at 30 degrees reads 15 % low."""
-    sound(told)
+def beam_low(told: Told, by: float) -> None:
+    """Lower the reading of one of four beams at 30 degrees by a share."""
     around = np.radians([45.0, 135.0, 225.0, 315.0])
     beams = np.column_stack([0.5 * np.cos(around), 0.5 * np.sin(around), np.full(4, -math.sqrt(0.75))])
     solved = np.linalg.pinv(beams)
     for _, topic, _, message in told.rows:
-        if wrong and topic == DVL:
+        if topic == DVL:
             v = message.twist.twist.linear
-            v.x, v.y, v.z = (solved @ (beams @ [v.x, v.y, v.z] * [1.0, 0.85, 1.0, 1.0])).tolist()
+            v.x, v.y, v.z = (solved @ (beams @ [v.x, v.y, v.z] * [1.0, 1.0 - by, 1.0, 1.0])).tolist()
+
+
+def one_beam_low(told: Told, wrong: bool) -> None:
+    """One beam reads 15 % low."""
+    sound(told)
+    beam_low(told, 0.15 * wrong)
+
+
+def one_beam_low_at_5_degrees(told: Told, wrong: bool) -> None:
+    """One beam reads 10 % low, of a DVL whose yaw of 5 degrees nothing says."""
+    sound(told, yaw=math.radians(5.0))
+    beam_low(told, 0.1 * wrong)
 
 
 def quaternion_components_mixed_up(told: Told, wrong: bool) -> None:
@@ -287,6 +298,9 @@ SITUATIONS = {
         told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate z in the DVL's driver"
     ),
     "one beam low": Situation(told_by(one_beam_low, long_motion), "BEAM_OFF", "at 135°"),
+    "one beam low, which looks like a misalignment": Situation(
+        told_by(one_beam_low_at_5_degrees, long_motion), "BEAM_OFF", "at 180°", yaw_deg=5.0, verdicts=("reject",)
+    ),
     "quaternion components mixed up": Situation(
         told_by(quaternion_components_mixed_up), "GRAVITY_LEANS", "check the IMU's mounting in its driver"
     ),
@@ -312,7 +326,7 @@ SITUATIONS = {
     "yaw that no drawing has": Situation(
         yaw_other_than_said(37.0),
         "MOUNTING_CONTRADICTED",
-        "try -p mounting_rpy:=[0deg,0deg,",
+        ": try -p mounting_rpy:=[0deg,0deg,",
         yaw_deg=37.0,
         verdicts=NOISY,
     ),
@@ -350,7 +364,12 @@ SITUATIONS = {
     ),
     "stamps an hour ahead": Situation(told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log"),
     "alignment of an RDI": Situation(lambda path, _: ensembles(path, -45.0), yaw_deg=-45.0, verdicts=NOISY),
-    "moving bed": Situation(lambda path, _: ensembles(path, bed_mps=np.array(BED_MPS)), verdicts=(*NOISY, "reject")),
+    "moving bed": Situation(
+        lambda path, wrong: ensembles(path, bed_mps=np.array(BED_MPS) * wrong),
+        "BED_MOVES",
+        "121 mm/s faster than the DVL towards 56°",
+        verdicts=NOISY,
+    ),
     "text of a DVL": Situation(lambda path, _: lines(path), verdicts=NOISY),
     "antenna on a mast": Situation(told_by(antenna_on_a_mast, long_motion), verdicts=NOISY),
     "fixes around a dive": Situation(told_by(fixes_around_a_dive, long_motion), verdicts=NOISY),

@@ -74,8 +74,8 @@ def diagnose(
         from ..unpaired.simulator_rounds import against
 
         sides = [discovered_in(as_paths(each), topics, params, slow) for each in (bags, simulator)]
-        real, made = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
-        return against(real, made, rounds, None if keep is None else Path(keep))
+        real, simulated = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
+        return against(real, simulated, rounds, None if keep is None else Path(keep))
     if rounds is not None or keep is not None:
         raise InputError("rounds, keep: only with simulator")
     from ..diagnosis.diagnose import diagnose as run
@@ -136,8 +136,8 @@ def _scenario(given: Mapping[str, Any]) -> Scenario:
     known = [each.name for each in fields(Scenario)]
     for name, value in given.items():
         if name not in known:
-            near = ["seconds"] if name == "duration" else difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+            similar = ["seconds"] if name == "duration" else difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {similar[0]!r}?" if similar else f"there are {', '.join(known)}"
             raise InputError(f"simulate: no such field {name!r}, {hint}")
         if name == "waves" and value is not None and not isinstance(value, Waves):
             raise InputError(f"simulate: waves={value!r}; expected Waves(height=0.5, period=6.0) (m, s)")

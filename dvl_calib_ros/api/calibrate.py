@@ -185,9 +185,9 @@ def fleet(
     from ..present.page import write_report
 
     merged, names = parameters_from(params, parameters)
-    asked = [str(each) for each in ([places] if isinstance(places, str | os.PathLike) else places)]
+    places_as_text = [str(each) for each in ([places] if isinstance(places, str | os.PathLike) else places)]
     given = Given(dvl_topic, gnss_topic, imu_topic, names)
-    found = run_fleet(asked, Path(out), merged, given, Workers(jobs, dask), vehicle_from)
+    found = run_fleet(places_as_text, Path(out), merged, given, Workers(jobs, dask), vehicle_from)
     write_report(found.page, found)
     return found
 

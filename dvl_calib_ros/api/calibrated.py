@@ -164,8 +164,8 @@ class Calibration:
         estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
         found = {each.name: each for each in quantities(result)}
         roll, pitch, yaw = (found[name] for name in ("roll", "pitch", "yaw"))
-        arm = [found.get(f"lever arm {axis}", _none(at)) for axis, at in zip("xyz", parameters.lever_arm, strict=True)]
-        scale = found.get("scale", _none(math.nan))
+        arm = [found.get(f"lever arm {axis}", _given(at)) for axis, at in zip("xyz", parameters.lever_arm, strict=True)]
+        scale = found.get("scale", _given(math.nan))
         offset_std = estimate.std_of("time_offset")
         return Mounting(
             (roll.value, pitch.value, yaw.value),
@@ -387,6 +387,6 @@ def _vectors(name: str, given: Array) -> Array:
     return found
 
 
-def _none(value: float) -> Quantity:
+def _given(value: float) -> Quantity:
     """Return a quantity that the model does not estimate, with its configured value."""
     return Quantity("", value, value, math.nan, "", False)

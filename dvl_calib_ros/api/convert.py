@@ -257,7 +257,7 @@ def report(
 
 def write(result: object, path: Path) -> None:
     """Write a result as JSON if the path ends in .json, else as a page. Raises InputError."""
-    document = _plain(result)
+    document = _document_function(result)
     if path.suffix.lower() == ".json":
         write_json(path, document())
         return
@@ -273,7 +273,7 @@ def write(result: object, path: Path) -> None:
     page.write_report(path, result)
 
 
-def _plain(result: Any) -> Callable[[], Any]:
+def _document_function(result: Any) -> Callable[[], Any]:
     """Return the function that makes plain data of a result. Raises InputError for other objects."""
     if isinstance(result, Calibration | Examination):
         return result.document

@@ -140,7 +140,7 @@ def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reas
     """
     is_rejected = verification.verdict is Severity.REJECT
     kept = [
-        each
+        each if each.severity is Severity.MARGINAL else each.weighed(Severity.REJECT)
         for each in contradictions
         if each.severity is Severity.MARGINAL or each.code in DECISIVE or (is_rejected and is_cause(each))
     ]

@@ -464,11 +464,11 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[R
         found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
     for estimate in result.estimates.values():
         found += gate_warnings(estimate)
-    return found + reference_warnings(result.estimate, result.own_days)
+    return found + reference_warnings(result.estimate)
 
 
 def _refusal_advice(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
-    """Return what is known about refused DVL messages."""
+    """Return the likely cause of refused DVL messages."""
     known = [str(found) for kind, found in decoder.problems.items() if kind.startswith("dvl")]
     known += map(str, decoder.dvl_type.advice(counts))
     return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."

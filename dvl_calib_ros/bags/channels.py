@@ -84,6 +84,7 @@ class Decoder:
             raise DecodingError(f"{type(error).__name__}: {error}") from error
 
     def _typestores(self, channel: Channel) -> list[Typestore]:
+        """Return the type stores of a channel, cached. Raises DefinitionError."""
         stores = self._stores.get(channel)
         if stores is None:
             try:
@@ -96,6 +97,7 @@ class Decoder:
         return stores
 
     def _make_typestores(self, channel: Channel) -> list[Typestore]:
+        """Build the type stores of a channel: from its definition, or from all known ones of its type."""
         _, msgtype, definition = channel
         key = (msgtype, definition)
         if key not in self._by_definition:
@@ -197,6 +199,7 @@ _SOUND = {
 
 
 def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
+    """Parse a definition (MSG or IDL). Raises DefinitionError for one too expensive to parse."""
     if len(definition.text) > LONGEST_DEFINITION:
         raise DefinitionError(f"the definition of {msgtype} has {len(definition.text)} characters")
     if definition.format is MessageDefinitionFormat.MSG:
@@ -212,7 +215,7 @@ def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
 
 
 def _without_constants(types: dict[str, Any]) -> dict[str, Any]:
-    """Remove the constants from types. Raises DefinitionError for definitions that no driver has."""
+    """Remove the constants from message types. Raises DefinitionError for an invalid name or array size."""
     for name, (_, fields) in types.items():
         for field, (kind, description) in fields:
             if not _TYPE.fullmatch(name) or not _FIELD.fullmatch(field):
@@ -241,18 +244,18 @@ def _check_finite(types: dict[str, Any]) -> None:
 
 def _n_values(description: Any, sizes: Mapping[str, int]) -> int:
     """Return the number of values that are decoded for a field; numbers of an array are decoded at once."""
-    kind, what = description
+    kind, detail = description
     size = sizes[_message_type_of(description)]
     if kind != Nodetype.ARRAY:
         return size
-    (element, element_what), n_elements = what
+    (element, element_what), n_elements = detail
     is_number = element == Nodetype.BASE and element_what[0] not in ("string", "wstring")
     return size if is_number else size * int(n_elements)
 
 
 def _message_type_of(description: Any) -> str:
     """Return the message type of a field or of its elements; '' for numbers and strings."""
-    kind, what = description
+    kind, detail = description
     while kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        kind, what = what[0]
-    return str(what) if kind == Nodetype.NAME else ""
+        kind, detail = detail[0]
+    return str(detail) if kind == Nodetype.NAME else ""

@@ -76,36 +76,36 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
     layouts = _Layouts(bag.decoder)
     arrived = 0
     for batches in _windows(bag.batches(topics)):
-        places = np.cumsum([0, *(batch.size for batch in batches)])
+        offsets = np.cumsum([0, *(batch.size for batch in batches)])
         log_ns = np.concatenate([np.minimum(batch.log_ns, LATEST_NS).astype(np.int64) for batch in batches])
         by_kind: dict[tuple[int, int], list[tuple[Batch, Index, Index]]] = {}
-        for batch, first in zip(batches, places.tolist(), strict=False):
-            for number, length, at in _kinds(batch):
+        for batch, first in zip(batches, offsets.tolist(), strict=False):
+            for number, length, index in _kinds(batch):
                 # the channel's id is cheap; its hash would take most of the time
                 kind = (id(batch.channels[number]), length)
-                by_kind.setdefault(kind, []).append((batch, at, first + at))
+                by_kind.setdefault(kind, []).append((batch, index, first + index))
         parts = []
-        for (_, length), found in by_kind.items():
-            batch, at, _ = found[0]
-            channel = batch.channels[int(batch.number[at[0]])]
-            place = np.concatenate([place for *_, place in found])
+        for (_, length), chunks in by_kind.items():
+            batch, index, _ = chunks[0]
+            channel = batch.channels[int(batch.number[index[0]])]
+            position = np.concatenate([position for *_, position in chunks])
             if channel.topic in one_by_one or not length:
-                data = [each for batch, at, _ in found for each in batch.part(at).data()]
-                parts.append(Part(channel, place + arrived, log_ns[place], None, data, bag.decoder))
+                data = [each for batch, index, _ in chunks for each in batch.part(index).data()]
+                parts.append(Part(channel, position + arrived, log_ns[position], None, data, bag.decoder))
                 continue
-            rows_of = [batch.rows(at, length) for batch, at, _ in found]
+            rows_of = [batch.rows(index, length) for batch, index, _ in chunks]
             contents = rows_of[0] if len(rows_of) == 1 else np.concatenate(rows_of)
             for columns, rows in layouts.split(channel, contents):
-                own = place if len(rows) == len(place) else place[rows]
+                positions = position if len(rows) == len(position) else position[rows]
                 data = [] if columns is not None else [each.tobytes() for each in contents[rows]]
-                parts.append(Part(channel, own + arrived, log_ns[own], columns, data, bag.decoder))
+                parts.append(Part(channel, positions + arrived, log_ns[positions], columns, data, bag.decoder))
         arrived += len(log_ns)
         yield Window(parts, int(log_ns[-1]))
 
 
 def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
     """Yield the batches of each window."""
-    taken: list[Batch] = []
+    pending: list[Batch] = []
     count = size = 0
     for batch in batches:
         sizes = np.cumsum(batch.end - batch.start)
@@ -114,14 +114,14 @@ def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
             before = int(sizes[first - 1]) if first else 0
             full = 1 + int(np.searchsorted(sizes, WINDOW_BYTES - size + before))
             end = min(first + WINDOW_MESSAGES - count, full, batch.size)
-            taken.append(batch.part(slice(first, end)))
+            pending.append(batch.part(slice(first, end)))
             count, size, first = count + end - first, size + int(sizes[end - 1]) - before, end
             # large batches are used directly, because joining would copy them
             if count >= WINDOW_MESSAGES or size >= WINDOW_BYTES or (first == batch.size and count >= ENOUGH_MESSAGES):
-                yield taken
-                taken, count, size = [], 0, 0
-    if taken:
-        yield taken
+                yield pending
+                pending, count, size = [], 0, 0
+    if pending:
+        yield pending
 
 
 def _kinds(batch: Batch) -> Iterator[tuple[int, int, Index]]:
@@ -163,6 +163,7 @@ class _Layouts:
             yield None, remaining
 
     def _learn(self, channel: Channel, data: bytes, known: list[Layout]) -> bool:
+        """Add the layout of a message to the known ones. Return False if it has none."""
         store = self._decoder.typestore(channel)
         if store is None or len(known) >= _MOST_LAYOUTS:
             return False
@@ -300,27 +301,30 @@ class _LayoutWalk:
             self._field(f"{prefix}{name}", description)
 
     def _field(self, path: str, description: Any) -> None:
-        kind, what = description
+        """Add a field by its kind. Raises NoLayoutError for a sequence."""
+        kind, detail = description
         if kind == Nodetype.NAME:
-            self.message(f"{path}.", what)
+            self.message(f"{path}.", detail)
         elif kind == Nodetype.ARRAY:
-            self._array(path, *what)
+            self._array(path, *detail)
         elif kind == Nodetype.SEQUENCE:
             raise NoLayoutError(f"{path} is a sequence")
-        elif what[0] == "string":
+        elif detail[0] == "string":
             self._string(path)
         else:
-            self._numbers(path, what[0])
+            self._numbers(path, detail[0])
 
     def _array(self, path: str, description: Any, size: int) -> None:
-        kind, what = description
-        if kind == Nodetype.BASE and what[0] in _FORMATS and what[0] != "bool":
-            self._numbers(path, what[0], size)
+        """Add an array of fixed size, as one column if its elements are numbers."""
+        kind, detail = description
+        if kind == Nodetype.BASE and detail[0] in _FORMATS and detail[0] != "bool":
+            self._numbers(path, detail[0], size)
             return
         for number in range(size):
             self._field(f"{path}[{number}]", description)
 
     def _numbers(self, path: str, name: str, size: int | None = None) -> None:
+        """Add one number, or an array of `size`, aligned to its size."""
         if name not in _FORMATS:
             raise NoLayoutError(f"{path} is {name}")
         format_ = self._order + _FORMATS[name]
@@ -331,6 +335,7 @@ class _LayoutWalk:
         self._add(path, format_ if size is None else (format_, (size,)), each * (1 if size is None else size))
 
     def _string(self, path: str) -> None:
+        """Add a string of the length in this message. Raises NoLayoutError."""
         self._align(4)
         try:
             (length,) = struct.unpack_from(f"{self._order}I", self._data, self.at)
@@ -348,6 +353,7 @@ class _LayoutWalk:
         self.at += -(self.at - ENCAPSULATION) % size
 
     def _add(self, path: str, format_: Any, size: int) -> None:
+        """Add a column of this NumPy format and number of bytes."""
         if len(self.fields) > _MOST_FIELDS:
             raise NoLayoutError("more fields than are worth it")
         self.fields[path] = format_, self.at
@@ -374,6 +380,7 @@ def _compare(layout: Layout, rows: Rows, message: Any) -> None:
 
 
 def _value_at(message: Any, path: str) -> Any:
+    """Return the value of a message at a path such as ``a.b[2]``."""
     for step in path.split("."):
         name, _, index = step.partition("[")
         message = getattr(message, name)

@@ -40,6 +40,7 @@ class _RawFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Set the position. Raises OSError for one before the start."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: os.fstat(self._descriptor).st_size}[whence]
         if start + offset < 0:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
@@ -47,6 +48,7 @@ class _RawFile(io.RawIOBase):
         return self._at
 
     def readinto(self, buffer: Any) -> int:
+        """Fill a buffer from the present position, with zeros in unreadable places. Return the count."""
         try:
             count = os.preadv(self._descriptor, [buffer], self._at)
         except OSError:  # read in pieces, and note the holes
@@ -63,13 +65,13 @@ class _RawFile(io.RawIOBase):
 
     def _read(self, size: int, at: int) -> bytes:
         """Read bytes; after an error read halves, so that a bad sector costs no more than itself."""
-        data = self._attempt(size, at)
+        data = self._read_once(size, at)
         if data is not None:
             return data
         size = min(size, os.fstat(self._descriptor).st_size - at)
         next_sector = (at // SECTOR + 1) * SECTOR
         if at + size <= next_sector:
-            data = self._attempt(size, at)  # a single failure may be transient
+            data = self._read_once(size, at)  # a single failure may be transient
             if data is None:
                 self._note(at, at + size)
                 return bytes(size)
@@ -77,7 +79,8 @@ class _RawFile(io.RawIOBase):
         middle = max((at + size // 2) // SECTOR * SECTOR, next_sector)
         return self._read(middle - at, at) + self._read(at + size - middle, middle)
 
-    def _attempt(self, size: int, at: int) -> bytes | None:
+    def _read_once(self, size: int, at: int) -> bytes | None:
+        """Read once; None if the disk cannot read it."""
         try:
             return os.pread(self._descriptor, size, at)
         except OSError as error:
@@ -88,6 +91,7 @@ class _RawFile(io.RawIOBase):
             return None
 
     def _note(self, start: int, end: int) -> None:
+        """Note an unreadable range, joined with those that it touches."""
         touching = [hole for hole in self.holes if hole[0] <= end and start <= hole[1]]
         self.holes = sorted(
             [hole for hole in self.holes if hole not in touching]
@@ -178,16 +182,16 @@ def _natural_order(path: Path) -> list[tuple[int, str]]:
 
 
 def decompressed(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
-    """Decompress a file, as far as it is readable."""
+    """Decompress the readable part of a file."""
     target = new_folder() / (path.stem if path.suffix == ".zstd" else path.name)
-    most = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
+    max_size = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
     try:
         with open_raw(path) as raw, zstd.open(raw, "rb") as packed, target.open("wb") as unpacked:
             # in small pieces: data before the damage must be written before the damage raises
             while piece := packed.read1():
                 unpacked.write(piece)
-                if unpacked.tell() > most:
-                    raise EOFError(f"it unpacks to more than {most} bytes")
+                if unpacked.tell() > max_size:
+                    raise EOFError(f"it unpacks to more than {max_size} bytes")
     except (zstd.ZstdError, EOFError) as error:
         notes.append(f"{path}: damaged ({error}); what could be unpacked is used")
     return target
@@ -217,6 +221,7 @@ def with_journal(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
 
 
 def _journal(path: Path, suffix: str) -> Path | None:
+    """Return the non-empty journal of an SQLite file; None without one."""
     for database in (path, path.resolve()):
         journal = database.with_name(f"{database.name}{suffix}")
         if journal.is_file() and journal.stat().st_size:

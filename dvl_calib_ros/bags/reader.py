@@ -124,7 +124,7 @@ class BagReader:
         chosen = frozenset(topics)
         if len(self._sources) == 1:
             return (message for batch in self._of_source(self._sources[0], chosen) for message in batch.messages())
-        streams = [self._singly(source, chosen) for source in self._sources]
+        streams = [self._single_messages(source, chosen) for source in self._sources]
         return (message for message in heapq.merge(*streams, key=itemgetter(0)) if message[1] is not _MARKER)
 
     def batches(self, topics: Iterable[str]) -> Iterator[Batch]:
@@ -134,7 +134,8 @@ class BagReader:
             return self._of_source(self._sources[0], chosen)
         return batched(self.raw_messages(chosen))
 
-    def _singly(self, source: Source, topics: frozenset[str]) -> Iterator[BagMessage]:
+    def _single_messages(self, source: Source, topics: frozenset[str]) -> Iterator[BagMessage]:
+        """Yield single messages of one source, after a marker at its first log time."""
         # a marker at the start: merging opens a recording only when its time comes
         yield source.span_ns[0], _MARKER, b""
         for batch in self._of_source(source, topics):
@@ -147,11 +148,11 @@ class BagReader:
         try:
             for batch in source.batches(topics):
                 newest_ns = int(batch.log_ns[-1])
-                whole = _unpacked(batch)
-                lost += batch.size - whole.size
-                read += whole.size
-                if whole.size:
-                    yield whole
+                unpacked = _unpacked(batch)
+                lost += batch.size - unpacked.size
+                read += unpacked.size
+                if unpacked.size:
+                    yield unpacked
         except DAMAGE as error:
             if not source.damage_noted:
                 self.notes.append(
@@ -162,6 +163,7 @@ class BagReader:
             self.notes.append(f"{source.path}: {lost} compressed messages are damaged and left out")
 
     def _open(self, path: Path) -> list[Source]:
+        """Open a bag, or all bags in a folder. Raises InputError."""
         try:
             if path.is_dir():
                 return self._open_folder(path)

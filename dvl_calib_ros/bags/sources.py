@@ -100,6 +100,7 @@ def batch_as_ros2(batch: Batch) -> Batch:
         return batch
 
     def converted(channel: Channel, data: bytes) -> tuple[Channel, bytes]:
+        """Convert a ROS 1 message to ROS 2; empty bytes if it cannot be decoded."""
         if id(channel) not in types:
             return channel, data
         as_ros2, store = types[id(channel)]
@@ -184,19 +185,20 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
     kinds = {MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
     kind = next((kinds[each] for each in kinds if magic.startswith(each)), storage_suffix(shown))
     if kind == ".mcap":
-        return _opened(path, shown, _open_mcap, salvage_mcap, notes)
+        return _open_or_salvage(path, shown, _open_mcap, salvage_mcap, notes)
     if kind == ".db3":
-        return _opened(with_journal(path, new_folder, notes), shown, _open_sqlite, salvage_sqlite, notes)
+        return _open_or_salvage(with_journal(path, new_folder, notes), shown, _open_sqlite, salvage_sqlite, notes)
     raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap, .db3 or .bag file")
 
 
-def _opened(
+def _open_or_salvage(
     path: Path,
     shown: Path,
     by_index: Callable[[Path, Path, list[str]], Source | None],
     salvage: Salvage,
     notes: list[str],
 ) -> Source:
+    """Open a file by its index, or salvage its messages if the index is damaged."""
     try:
         source, why = by_index(path, shown, notes), ""
     except DAMAGE as error:
@@ -237,6 +239,7 @@ def _open_mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
         counts[channels[number]] += count
 
     def batches(topics: Collection[str]) -> Iterator[Batch]:
+        """Yield batches of these topics, in order of log time if they fit into memory."""
         wanted = {number: channel for number, channel in channels.items() if channel.topic in topics}
         in_order = bytes_at_once(summary, wanted) <= MERGED_AT_ONCE
         found = indexed_messages(path, summary, wanted, in_order)
@@ -247,6 +250,7 @@ def _open_mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
 
 
 def _open_sqlite(path: Path, shown: Path, notes: list[str]) -> Source:
+    """Open an SQLite bag; messages after a damaged place are salvaged."""
     database = Database(path)
     if database.astray:
         notes.append(f"{shown}: {database.astray} messages belong to topics that it does not list; they are left out")
@@ -286,6 +290,7 @@ def _open_salvaged(path: Path, shown: Path, salvage: Salvage, why: str, notes: l
 
 
 def _with_channels(salvaged: Iterator[Salvaged]) -> Iterator[BagMessage]:
+    """Replace topic, type and definition of salvaged messages by their channel."""
     channels: dict[tuple[str, ...], Channel] = {}
     for topic, msgtype, encoding, definition, log_ns, data in salvaged:
         key = (topic, msgtype, encoding, definition)
@@ -300,6 +305,7 @@ def _salvaging_after_damage(batches: Batches, path: Path, salvage: Salvage, coun
     """Read by the index and, after damage, the remaining messages by salvaging. counts: announced by the index."""
 
     def all_batches(topics: Collection[str]) -> Iterator[Batch]:
+        """Yield the batches of the index, then what salvaging finds beyond them. Raises DamagedError."""
         read = 0
         announced = sum(count for channel, count in counts.items() if channel.topic in topics)
         try:
@@ -348,6 +354,7 @@ def _unread_messages(
     damage, found = "", 0
 
     def others() -> Iterator[BagMessage]:
+        """Yield the salvaged messages that the index has not given."""
         nonlocal damage, found
         try:
             for message in _with_channels(salvaged):

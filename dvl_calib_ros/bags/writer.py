@@ -138,6 +138,7 @@ class BagWriter:
         self._write(channel, log_ns, data)
 
     def _write(self, channel: Channel, log_ns: int, data: bytes) -> None:
+        """Write a message to the part that fits its channel."""
         part = self._part_of.get(channel)
         if part is None:
             part = self._part_of[channel] = self._part_for(channel)
@@ -146,12 +147,14 @@ class BagWriter:
         part.writer.write(part.connections[channel], log_ns, data)
 
     def _part_for(self, channel: Channel) -> _Part:
+        """Return a file whose definitions agree with a channel's, a new one if there is none."""
         fitting = [part for part in self._parts if part.fits(channel)]
         part = fitting[0] if fitting else self._new_part()
         part.add(channel)
         return part
 
     def _new_part(self) -> _Part:
+        """Open one more file of the bag."""
         number = len(self._parts)
         path = self._path / f"{self._path.name}_{number}" if number else self._path
         writer = _Writer(
@@ -186,6 +189,7 @@ class BagWriter:
         (first / "metadata.yaml").write_text(yaml.safe_dump(metadata[0], sort_keys=False), encoding="utf-8")
 
     def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:
+        """Return the error for a failed write, with a remedy."""
         why = getattr(error, "strerror", None) or error
         # SQLite reports a full disk only as text, and a file that may not grow like any failure
         full = isinstance(error, sqlite3.Error) or error.errno in NO_SPACE
@@ -213,6 +217,7 @@ class _Part:
         return self._definitions.get(channel.msgtype, channel.definition) == channel.definition
 
     def add(self, channel: Channel) -> None:
+        """Add a channel with its definition and the hash of its type."""
         topic, msgtype, definition = channel
         self._definitions[msgtype] = definition
         text = definition.text if definition else ""
@@ -221,6 +226,7 @@ class _Part:
 
 
 def _type_hash(definition: Definition | None, msgtype: str) -> str:
+    """Return the REP 2011 hash of a type, or `UNKNOWN_HASH` if its definition is damaged."""
     try:
         return typestore(definition, msgtype).hash_rihs01(msgtype)
     except (DefinitionError, LookupError):  # a damaged or incomplete definition; its messages are whole

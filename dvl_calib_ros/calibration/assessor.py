@@ -13,7 +13,7 @@ from ..verdict.reasons import Reason
 from .assessment.dead_reckoning import Navigation, SlowNoise, dead_reckoned, doubts, objections
 from .assessment.manoeuvre_planner import drift_left_open
 from .checks.beam_faults import BeamFault
-from .estimators.estimator import NEVER, Estimator, Rest
+from .estimators.estimator import NEVER, Estimator, Residuals
 from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
 from .filters.filter_setup import nis_bounds
 from .filters.observability import MEASURES_TURNS, MEASURES_VERTICAL, convergence, observability
@@ -59,13 +59,13 @@ class Assessor:
     def so_far(self, name: str, *, fresh: bool) -> Verification:
         """Return the verdict of a running calibration, by the worker's latest evaluation unless `fresh`."""
         estimate, further = self._estimate(name, fresh=fresh), self._further
-        rest, suggestion = further.rest(fresh=fresh), further.suggestion if fresh else further.suggestion_so_far
+        errors, suggestion = further.residuals(fresh=fresh), further.suggestion if fresh else further.suggestion_so_far
         if MODELS[name].from_positions:
             held_out = self._held_out(name, Moments()) if fresh else None
             return self._judged(estimate, held_out, None, (0.0, np.zeros((3, 3, 3))), suggestion)
-        if rest is None or not MODELS[name].aided:
+        if errors is None or not MODELS[name].aided:
             return self._judged(estimate, None, None, (0.0, np.zeros((3, 3, 3))), suggestion)
-        return self._judged(estimate, rest.held_out, rest.typical, rest.judged, suggestion)
+        return self._judged(estimate, errors.held_out, errors.typical, errors.judged, suggestion)
 
     def _held_out(self, name: str, moments: Moments) -> HeldOutError | None:
         rotation_dvl_from_body = self._estimates.parameters.rotation_dvl_from_body
@@ -110,8 +110,8 @@ class Assessor:
         latest evaluation.
         """
         further, p = self._further, self._estimates.parameters
-        suggested, rest = further.suggestion if fresh else further.suggestion_so_far, further.rest(fresh=fresh)
-        navigation = None if rest is None else rest.navigation
+        suggested, errors = further.suggestion if fresh else further.suggestion_so_far, further.residuals(fresh=fresh)
+        navigation = None if errors is None else errors.navigation
         if MODELS[name].from_positions:
             navigation = self._estimates.estimators[name].navigation() if fresh else None
         found = doubts(
@@ -120,7 +120,7 @@ class Assessor:
             navigation,
             p,
             suggested=suggested is not None,
-            in_earth=rest is not None and rest.in_earth,
+            in_earth=errors is not None and errors.in_earth,
             is_level=fresh and further.is_level,
         )
         found += of_clocks
@@ -311,14 +311,14 @@ class NonlinearEstimators:
         return min((each.n_taken for each in self._all), default=NEVER)
 
     @property
-    def n_told(self) -> tuple[int, ...]:
+    def n_results(self) -> tuple[int, ...]:
         """Counters, by estimator, that grow when it may have new results."""
-        return tuple(each.n_told for each in self._all)
+        return tuple(each.n_results for each in self._all)
 
     @property
-    def told_until_ns(self) -> int | None:
+    def affected_from_ns(self) -> int | None:
         """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
-        return min((until for each in self._all if (until := each.told_until_ns) is not None), default=None)
+        return min((until for each in self._all if (until := each.affected_from_ns) is not None), default=None)
 
     @property
     def reference_claims(self) -> bool:
@@ -365,9 +365,9 @@ class NonlinearEstimators:
         """Registration of clocks and frames by the latest evaluation; None if not known."""
         return self._first(lambda each: each.registration_so_far)
 
-    def rest(self, *, fresh: bool) -> Rest | None:
+    def residuals(self, *, fresh: bool) -> Residuals | None:
         """Return the calibration's residuals, evaluated now if `fresh`, else the latest; None if not available."""
-        return self._first(lambda each: each.rest(fresh=fresh))
+        return self._first(lambda each: each.residuals(fresh=fresh))
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:

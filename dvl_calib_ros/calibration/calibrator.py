@@ -174,6 +174,7 @@ class Calibrator:
             each.advance()
 
     def _restart(self, back_s: float) -> None:
+        """Restart after a clock step, by `back_s` backward (s), negative if forward."""
         self.restarts += 1
         how = f"back by {back_s:.1f} s" if back_s > 0.0 else f"ahead by {-back_s / 86_400.0:.0f} days"
         self._on_event(f"DVL stamps went {how}: the calibration starts anew")
@@ -245,7 +246,7 @@ class Calibrator:
         rows, end = self._aligner.rows, self._aligner.partners.n_paired
         first = self._n_selected - rows.base
         stamps_ns = rows.stamps_ns[first : end - rows.base]
-        until_ns = self._further.told_until_ns
+        until_ns = self._further.affected_from_ns
         if until_ns is not None:
             stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, until_ns))]
         if len(stamps_ns):
@@ -290,7 +291,7 @@ class Calibrator:
             share = block.share(group.needs is Needs.REFERENCE)
             after = group.update(block.stamps_ns, seen.observations, share, block.prior_known, ends)
         elif ends is not None:
-            after = group.standing(len(ends))
+            after = group.snapshot(len(ends))
         if self._trace is not None and wanted is not None and after is not None:
             self._trace.add(wanted, group, after)
 
@@ -344,9 +345,9 @@ class Calibrator:
         return counted(self._aligner, self.selection.gnss.losses, self.restarts, restarted)
 
     @property
-    def refused_as(self) -> Mapping[str, set[str]]:
+    def reason_of_refusal(self) -> Mapping[str, set[str]]:
         """Names of the counters that hold refused messages, by stream."""
-        return self._aligner.refused_as
+        return self._aligner.reason_of_refusal
 
     @property
     def first_ns(self) -> int | None:
@@ -512,8 +513,8 @@ class Calibrator:
     @property
     def doubts_so_far(self) -> Sequence[Reason]:
         """`doubts` by the latest evaluation, recomputed (some milliseconds) only when its inputs have changed."""
-        clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_told
-        of = (self.selected, *self._further.n_told, *(each.code for each in clocks))
+        clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_results
+        of = (self.selected, *self._further.n_results, *(each.code for each in clocks))
         if self._doubted is None or self._doubted[0] != of:
             self._doubted = of, self._judge.doubts(self.selected, clocks, fresh=False)
         return self._doubted[1]

@@ -136,6 +136,7 @@ def _parse_now(words: Sequence[str]) -> dict[str, float]:
 
 
 def _settings_lines(chosen: InstrumentSettings) -> list[str]:
+    """Return the settings of an instrument, with document and notes, as lines to print."""
     return [
         f"{chosen.instrument}, by: {chosen.document}",
         *(f"  {setting}" for setting in chosen.settings),
@@ -152,8 +153,8 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
-    near = near_angles(calibrated.rpy, calibrated.parameters.mounting_rpy)  # as in the report, 180.4° not -179.6°
-    degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(near))
+    angles = near_angles(calibrated.rpy, calibrated.parameters.mounting_rpy)  # as in the report, 180.4° not -179.6°
+    degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(angles))
     known = calibrated.position is not None
     transform = (
         f"ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}" if known else POSITION_UNKNOWN
@@ -170,9 +171,9 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
         found = "found" if calibrated.lever_arm_found else "as lever_arm says"
         lines.append(f"lever arm: {_metres(calibrated.lever_arm)} from the reference point, {found}")
     if calibrated.dvl_time_offset:
-        late = "late" if calibrated.dvl_time_offset > 0.0 else "early"
+        way = "late" if calibrated.dvl_time_offset > 0.0 else "early"
         lines.append(
-            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late} against the IMU's in "
+            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {way} against the IMU's in "
             "this recording: URDF and TF have no delay; --params writes dvl_time_offset, or set the DVL's clock"
         )
     if calibrated.position is not None:

@@ -144,6 +144,7 @@ def _complete() -> NoReturn:
 
 
 def _fail(command: str, message: str) -> int:
+    """Print a message in one line on standard error. Return exit code 2."""
     try:
         sys.stdout.flush()  # otherwise the interpreter complains about it at exit
     except OSError:

@@ -36,6 +36,7 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _parameter_completions(**_: Any) -> list[str]:
+    """Return the completions of -p: ``name:=`` and, for a choice, each of its values."""
     from ..calibration.models.parameters import SCHEMA
 
     choices = [f"{name}:={choice}" for name, spec in SCHEMA.items() for choice in spec.choices]

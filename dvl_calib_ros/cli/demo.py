@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; its log: {log.read()[-2000:]}")
-        offline = _offline(bag, latency, with_history=arguments.report is not None)
+        offline = _replay_offline(bag, latency, with_history=arguments.report is not None)
         agree = _compare(out, saved, offline.result)
     _show_diagnosis(out, bag)
     if arguments.report is not None:
@@ -86,6 +86,7 @@ def _latency(speed: float) -> str:
 
 
 def _show_live(out: Any, bag: Path, speed: float) -> None:
+    """Play the bag to the node and show its estimates live."""
     from rich.live import Live
 
     from ..demo.watch import Watcher
@@ -113,7 +114,8 @@ def _truth() -> dict[str, float]:
     return angles | {"delta_k": 100.0 * scale[0]}
 
 
-def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
+def _replay_offline(bag: Path, latency: str, with_history: bool) -> Replayed:
+    """Replay the bag with the node's latency."""
     from ..bag_replay.replay import replay
     from ..files.parameter_files import load_parameters
 
@@ -152,6 +154,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
 
 
 def _show_diagnosis(out: Any, bag: Path) -> None:
+    """Diagnose the bag and print verdict and effects."""
     from ..calibration.models.parameters import Parameters
     from ..diagnosis.diagnose import diagnose
 
@@ -182,7 +185,7 @@ def take_domain() -> int:
     It stays reserved until `give_back` or the end of this process. Raises InputError if there is none.
     """
     for domain in random.sample(DOMAINS, len(DOMAINS)):
-        if _take(domain):
+        if _claim_domain(domain):
             if not _has_participant(domain):
                 return domain
             give_back(domain)
@@ -196,7 +199,7 @@ def give_back(domain: int) -> None:
     _taken.pop(domain).close()
 
 
-def _take(domain: int) -> bool:
+def _claim_domain(domain: int) -> bool:
     """Claim a ROS domain for this process; return whether it was free."""
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
@@ -209,6 +212,7 @@ def _take(domain: int) -> bool:
 
 
 def _has_participant(domain: int) -> bool:
+    """Return whether a DDS participant on this host already uses a ROS domain."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("", PORT_BASE + DOMAIN_GAIN * domain + FIRST_PARTICIPANT))

@@ -100,6 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     written: list[str] = []
 
     def answer() -> None:
+        """Print the diagnosis and the written files."""
         layout = present.diagnosis if arguments.verbose else present.first_screen
         common.print_document(layout(diagnosis), discovery.doubts)
         common.print_found(discovery, arguments.bags, first_only=not arguments.verbose)
@@ -107,6 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
             common.console().print(line, soft_wrap=True, markup=False)
 
     def apply(path: Path) -> None:
+        """Write the parameters that correct the diagnosed errors, per recording if they differ."""
         days: dict[int | None, Path] = {None: path}
         if any(effect.by_recording for effect in diagnosis.effects):
             days |= {index: of_each[name] for index, (name, _) in enumerate(diagnosis.recordings)}
@@ -147,7 +149,7 @@ def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
 
 
 def _samples(words: Sequence[str] | None) -> tuple[int, Path | None]:
-    """Return number and file of --samples, 0 and None without. Raises InputError."""
+    """Return the number of posterior samples and their file, 0 and None without --samples. Raises InputError."""
     if words is None:
         return 0, None
     if not words[0].isdecimal() or not 1 <= int(words[0]) <= MOST_SAMPLES:
@@ -210,17 +212,17 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
     common.check_outputs(arguments, "json", "report", folders=["keep"])
     write_report = report_writer(arguments)
     real = _open_side(arguments, arguments.bags, arguments.params, defaults)
-    made = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
+    sim = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
     with common.progress("comparing") as on_progress:
         found = against(
-            real[0], made[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
+            real[0], sim[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
         )
     document = closed_gap_document(found) if isinstance(found, ClosedGap) else unpaired_document(found)
 
     def answer() -> None:
-        common.print_document(DOCUMENTS[type(found)](found), [*real[1].doubts, *made[1].doubts])
+        common.print_document(DOCUMENTS[type(found)](found), [*real[1].doubts, *sim[1].doubts])
         common.print_found(real[1], arguments.bags)
-        common.print_found(made[1], arguments.simulator)
+        common.print_found(sim[1], arguments.simulator)
 
     common.deliver(
         answer,

@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..examination.examine import examine
     from ..present import examination as present
 
-    _check(arguments)
+    _check_arguments(arguments)
     common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments)
     parameters = common.load(arguments)
@@ -57,7 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
     return int(examination.verdict == "no")
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check_arguments(arguments: argparse.Namespace) -> None:
+    """Raise InputError unless either bags or a valid live duration are given."""
     if bool(arguments.bags) == (arguments.live is not None):
         raise InputError(
             "name a BAG, or the topics there are: --live" if not arguments.bags else "a BAG or --live, not both"

@@ -47,17 +47,18 @@ def run(arguments: argparse.Namespace) -> None:
                 "names another"
             )
         if what == "set":
-            (result,) = _answer(node, full_name, client.set_parameters, [Parameter(name, value=new)]).results
+            (result,) = _request(node, full_name, client.set_parameters, [Parameter(name, value=new)]).results
             if not result.successful:
                 raise InputError(f"{name}: {result.reason}")
         names = list(SCHEMA) if name is None else [name]
-        for each, found in zip(names, _answer(node, full_name, client.get_parameters, names).values, strict=True):
+        for each, found in zip(names, _request(node, full_name, client.get_parameters, names).values, strict=True):
             found = parameter_value_to_python(found)
             fixed = "  # only at the start" if SCHEMA[each].read_only else ""
             show(f"{each}: {as_yaml(list(found) if hasattr(found, 'tolist') else found)}{fixed}")
 
 
-def _answer(node: Any, name: str, ask: Any, about: Any) -> Any:
+def _request(node: Any, name: str, ask: Any, about: Any) -> Any:
+    """Send a request until the node answers. Raises InputError after `TRIES`."""
     import rclpy
 
     for _ in range(TRIES):

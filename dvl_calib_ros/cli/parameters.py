@@ -57,10 +57,10 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.commands:
         show(*command_table().splitlines())
         return
-    if asked := next((name for name in _TABLES if getattr(arguments, name)), None):
+    if table := next((name for name in _TABLES if getattr(arguments, name)), None):
         from ..verdict.reasons import TABLES, lookup
 
-        show(*lookup(TABLES[asked]).splitlines())
+        show(*lookup(TABLES[table]).splitlines())
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters

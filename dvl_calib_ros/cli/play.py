@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.reader import BagReader
     from ..errors import InputError
 
-    _check(arguments)
+    _check_arguments(arguments)
     start, duration = arguments.start_offset, arguments.playback_duration
     with common.ros_node("play", "dvl_calib_player") as (node, ending):
         from ..demo.player import BagPlayer, wait_until
@@ -95,6 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _wait_for_subscribers(player: BagPlayer, has_ended: Callable[[], bool]) -> None:
+    """Wait until every published topic has a subscriber, and print which ones have none."""
     from ..demo.player import BREATH_S
 
     began, is_said = time.monotonic(), False
@@ -105,7 +106,8 @@ def _wait_for_subscribers(player: BagPlayer, has_ended: Callable[[], bool]) -> N
         time.sleep(BREATH_S)
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check_arguments(arguments: argparse.Namespace) -> None:
+    """Raise InputError for an option outside its range."""
     from ..errors import InputError
 
     for name, (low, high) in (("rate", RATES), ("clock", CLOCKS_HZ)):
@@ -142,6 +144,7 @@ def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str])
     from ..recordings.topics import spelled
 
     def found(name: str, option: str) -> str:
+        """Return a topic as spelled in the recording. Raises InputError if it is missing."""
         spelled_topic = spelled(name, bag.topics)
         if spelled_topic is None:
             raise InputError(f"{option}: {name} is not in the recording, which has {', '.join(sorted(bag.topics))}")

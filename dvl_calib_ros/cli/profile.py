@@ -30,16 +30,17 @@ def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str
 
     Prints the profile and its options on standard error. Raises InputError.
     """
-    path = _path(arguments.profile)
+    path = _profile_file(arguments.profile)
     if path is None:
         return [*argv]
-    words = _words(path)
+    words = _profile_words(path)
     say(f"profile {path}: {shlex.join(words)}")
     after = list(argv).index(arguments.command) + 1
     return [*argv[:after], *words, *argv[after:]]
 
 
-def _path(name: str | None) -> Path | None:
+def _profile_file(name: str | None) -> Path | None:
+    """Return the file of a profile, by default the one in the current folder, if any."""
     if name is None:
         return IN_FOLDER if IN_FOLDER.exists() else None
     if name == "none":
@@ -54,7 +55,7 @@ def _path(name: str | None) -> Path | None:
     return path
 
 
-def _words(path: Path) -> list[str]:
+def _profile_words(path: Path) -> list[str]:
     """Return a profile's content as command-line words. Raises InputError."""
     from ..disk.text_files import load_yaml
     from ..files.parameter_files import as_yaml

@@ -43,8 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
     from ..files.result_file import result_document, save_result
     from ..verdict.kinds import Severity
 
-    asked = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
-    models = list(MODELS) if arguments.verbose or not asked else asked
+    extra = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
+    models = list(MODELS) if arguments.verbose or not extra else extra
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "save", "report")
     write_report = report_writer(arguments, "write_replay_report")
@@ -55,9 +55,9 @@ def run(arguments: argparse.Namespace) -> int:
             recording, discovery, on_progress, merge=arguments.merge, with_history=arguments.report is not None
         )
     result = replayed.result
-    if asked and not any(name in result.estimates for name in asked):
+    if extra and not any(name in result.estimates for name in extra):
         raise InputError(
-            f"--models: {', '.join(asked)} needs positions, and the reference has velocities; name another model, "
+            f"--models: {', '.join(extra)} needs positions, and the reference has velocities; name another model, "
             "or a topic of positions with --gnss-topic"
         )
     discovery = discovery.with_mounting(result.parameters["mounting_rpy"])
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         save_result(path, document, round(parameters.result_backups))
 
     common.deliver(
-        lambda: _print(arguments, replayed, discovery, models if arguments.verbose else asked),
+        lambda: _print(arguments, replayed, discovery, models if arguments.verbose else extra),
         (arguments.json, write),
         (arguments.save, save),
         (arguments.report, lambda path: write_report(path, replayed, arguments.bags, models)),
@@ -80,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
+    """Print the result of a replay with warnings and next commands."""
     from ..present import replay as present
 
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])

@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..simulation.sensors import DvlErrors, ImuErrors
     from ..simulation.trajectories import Waves
 
-    _check(arguments)
+    _check_ranges(arguments)
     defaults = _defaults()
     check(arguments, defaults)
     common.check_outputs(arguments, folders=["output"])
@@ -164,7 +164,7 @@ def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace,
 
     for name in OF_THE_DVL:
         if getattr(arguments, name) != getattr(defaults, name):
-            raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} has it, too; leave one of the two out")
+            raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} sets it as well; omit one of the two")
     description = load_description(arguments.diagnosis)
     scenario, left_out = with_dvl(scenario, description)
     notes = [
@@ -197,7 +197,8 @@ LIMITS = {
 MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # zero means no such sensor
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check_ranges(arguments: argparse.Namespace) -> None:
+    """Raise InputError for an option outside its range."""
     if len(arguments.scale) not in (1, 3):
         raise InputError("--scale: give one number for all axes, or three")
     for name, (low, high) in LIMITS.items():

@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _listener(node: str) -> Listener:
+    """Return a listener to a node's diagnostics. Raises InputError without ROS."""
     from ..errors import needing_ros
 
     with needing_ros("watch"):
@@ -80,7 +81,7 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
             show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines, True)
             n_shown = len(log.lines) if process.poll() is None else 0  # number of lines already on the screen
         finally:
-            code = _ended(process)
+            code = _end_process(process)
         for text in log.finished()[n_shown:]:
             say(text)
     return code
@@ -99,7 +100,8 @@ def node_command(ros_arguments: Sequence[str]) -> list[str]:
     return [sys.executable, "-m", "dvl_calib_ros.node.main", ENDS_WITH_STDIN, *ros_arguments]
 
 
-def _ended(process: subprocess.Popen[bytes]) -> int:
+def _end_process(process: subprocess.Popen[bytes]) -> int:
+    """Ask the node to end by closing its standard input; kill it after `PATIENCE_S`. Return its exit code."""
     assert process.stdin is not None  # a pipe
     process.stdin.close()
     try:
@@ -228,7 +230,7 @@ class View:
         lines = 1 if width >= WIDE else 2
         return [
             state,
-            _goal(status, *GOALS[0], width),
+            _goal_row(status, *GOALS[0], width),
             Row(following, "bold green" if "GOOD" in code else "bold", most=lines, least=lines),
             Row(KEYS, "dim", most=lines),
             Row("" if self.event in warnings else self.event, "cyan", most=4 if "(y/n)" in self.event else 2),
@@ -240,6 +242,7 @@ def _is_usable(status: Status) -> bool:
 
 
 def _warnings(status: Status) -> list[str]:
+    """Return errors first, then a withdrawn result, warnings, and why the calibration takes longer."""
     found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
     found = found or [status.message] * bool(status.level)
     urgent = found[:1] if status.level > 1 else []  # an error, which comes first
@@ -270,8 +273,8 @@ def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
         yield from first
     yield from between
     yield Row("   ".join(_stream(status, *each) for each in STREAMS))
-    yield from (_goal(status, *each, width) for each in GOALS[1:] if f"goal {each[0]} [%]" in status.values)
-    yield Row(_rose(status))
+    yield from (_goal_row(status, *each, width) for each in GOALS[1:] if f"goal {each[0]} [%]" in status.values)
+    yield Row(_heading_bars(status))
 
 
 def _duration(text: str, rough: bool = False) -> str:
@@ -296,31 +299,33 @@ def _number(text: str) -> float:
     return number if 0.0 < number < 1e9 else 0.0
 
 
-def _stream(status: Status, name: str, shown: str) -> str:
+def _stream(status: Status, name: str, label: str) -> str:
     age = status.get(f"{name} age [s]")
-    return f"{shown} none yet" if age == "-" else f"{shown} {status.get(f'{name} rate [Hz]')} Hz, {age} s ago"
+    return f"{label} none yet" if age == "-" else f"{label} {status.get(f'{name} rate [Hz]')} Hz, {age} s ago"
 
 
-def _quantity(status: Status, name: str, unit: str, shown: str) -> str:
+def _quantity(status: Status, name: str, unit: str, label: str) -> str:
     value, std = status.get(f"mounting {name} [{unit}]"), status.get(f"sigma mounting {name} [{unit}]")
     is_estimated = std[:1].isdigit() and status.values.get("samples used") != "0"  # without a sample σ is the prior's
-    return f"{name:5} {value:>7}" + (f" ±{std}{shown}" if is_estimated else f"{shown}, as set").ljust(11)
+    return f"{name:5} {value:>7}" + (f" ±{std}{label}" if is_estimated else f"{label}, as set").ljust(11)
 
 
-def _goal(status: Status, key: str, shown: str, width: int) -> Row:
+def _goal_row(status: Status, key: str, label: str, width: int) -> Row:
+    """Return one row with a value, its progress bar, and the predicted drift."""
     percent = min(_number(status.get(f"goal {key} [%]")), 100.0)
     names = {"worth": "worth", "side": "worth to the side", "ahead": "worth ahead"}
     goal = f", goal {status.get('target')}" if key == "worth" else ""
     bar = max(0, min(BAR, width - 34))
     full = round(bar * percent / 100.0)
-    text = f"{shown:7}{'█' * full}{'░' * (bar - full)} {percent:3.0f} %  {status.get(names[key])} m/km{goal}"
+    text = f"{label:7}{'█' * full}{'░' * (bar - full)} {percent:3.0f} %  {status.get(names[key])} m/km{goal}"
     return Row(text, "green" if percent >= 100.0 else "yellow")
 
 
-def _rose(status: Status) -> str:
+def _heading_bars(status: Status) -> str:
+    """Return the time driven on each sector of headings as a row of bars."""
     driven = [_number(status.get(f"driven {sector} [s]")) for sector in SECTORS]
-    most = max(max(driven), 1.0)
-    heights = (HEIGHTS[round((len(HEIGHTS) - 1) * seconds / most)] for seconds in driven)
+    longest = max(max(driven), 1.0)
+    heights = (HEIGHTS[round((len(HEIGHTS) - 1) * seconds / longest)] for seconds in driven)
     return "headings  " + "  ".join(f"{sector}{height}" for sector, height in zip(SECTORS, heights, strict=True))
 
 
@@ -333,7 +338,7 @@ def line(status: Status) -> str:
 
 
 class Keys:
-    """Keyboard commands to a node. `said` is the last answer, `page` the number of presses of w.
+    """Keyboard commands to a node. `last_answer` is the answer of the last service, `page` the number of presses of w.
 
     ends_node: whether the node ends with the view. Then q saves first, and asks before a better result is replaced.
     """
@@ -347,7 +352,7 @@ class Keys:
         self.page = 0
 
     @property
-    def said(self) -> str:
+    def last_answer(self) -> str:
         """Last answer."""
         return self._own or self._listener.answer
 
@@ -410,7 +415,7 @@ def show(
     terminal the view is drawn in place; elsewhere a line is written after a change, or periodically.
     """
     if not console.is_terminal or console.is_dumb_terminal:
-        for text in _lines(listener.latest, is_running):
+        for text in _log_lines(listener.latest, is_running):
             console.print(text, markup=False, soft_wrap=True)
         return
     from rich.live import Live
@@ -424,7 +429,7 @@ def show(
                     return
             if keys.has_left():
                 return
-            news = (_message(log[-1]) if log else "", keys.said)
+            news = (_message(log[-1]) if log else "", keys.last_answer)
             event = next((new for new, old in zip(news, before, strict=True) if new != old), event)
             before = news
             live.update(View(status, now_s, log, event, keys.page), refresh=True)
@@ -435,7 +440,8 @@ def _message(logged: str) -> str:
     return re.sub(r"^\[(\w+)\] \[[\d.]+\] \[[^\]]*\]: ", "", logged)
 
 
-def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
+def _log_lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
+    """Yield a line when model, convergence or severity change, and at least every `LINE_S`."""
     printed, printed_s = ("", "", ""), 0.0
     told_s = time.monotonic()
     while is_running():

@@ -117,9 +117,9 @@ class BagPlayer:
                     break
                 if at < start_s and channel.topic not in LATCHED:
                     continue
-                asked = time.monotonic()
+                published_s = time.monotonic()
                 on_time(at, sent)
-                began += time.monotonic() - asked
+                began += time.monotonic() - published_s
                 while next_tick <= at and not has_ended():
                     wait_until(began + next_tick / speed, has_ended)
                     self._publish_clock(first_ns + round(next_tick * 1e9))
@@ -134,6 +134,7 @@ class BagPlayer:
         return sent
 
     def _publish_clock(self, nanoseconds: int) -> None:
+        """Publish the recording's time, if requested."""
         if self._clock is not None:
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 1_000_000_000)

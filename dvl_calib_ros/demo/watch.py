@@ -74,6 +74,7 @@ class Watcher:
         switches = [(switch_at_s, switch_to), (back_at_s, "auto")]
 
         def on_time(at: float, sent: Mapping[str, int]) -> None:
+            """Switch the model when its time has come, and wait for the node to catch up."""
             self._time = at
             if switches and at >= switches[0][0]:
                 self._switch(switches.pop(0)[1])
@@ -104,6 +105,7 @@ class Watcher:
         self._estimate = message
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Keep the newest values, and note a change of model."""
         self._diagnostics = {item.key: item.value for status in message.status for item in status.values}
         why = f"running {self._diagnostics.get('model')} ({self._diagnostics.get('why')})"
         if why != self._shown_why:
@@ -123,6 +125,7 @@ class Watcher:
         return Group(table, self._diagnostics.get("gnss", ""), *self._events[-10:])
 
     def _cells(self, place: int, factor: float) -> tuple[str, str]:
+        """Return value and σ of one component of the estimate as text, in a unit by `factor` from SI."""
         if self._estimate is None:
             return "-", "-"
         twist = self._estimate.twist

@@ -35,16 +35,16 @@ from .search.arm_clock_ambiguity import (
     LAG,
     TWO_CLOCKS,
     Combination,
+    ambiguous_combination,
     combination,
-    opened_combination,
-    with_moved,
-    with_open,
+    with_ambiguity,
+    with_changes,
 )
 from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
-from .search.observable_parameters import somewhere, with_observable
-from .search.unexplained import Unexplained, matters, moved_by, unexplained, without_replaceable
+from .search.observable_parameters import default_values, with_observable
+from .search.unexplained import Unexplained, find_unexplained, is_predictive, nuisance_shift, without_replaceable
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 
@@ -89,14 +89,14 @@ def diagnose_recordings(
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> Diagnosis:
-    """Diagnose recordings in memory. Raises InputError for clock offsets too large to compare."""
-    says_nothing = _says_nothing(recordings)
-    if says_nothing:
-        return _nothing_to_say(says_nothing, notes)
+    """Select, fit and validate effects on recordings in memory. Raises InputError for too large clock offsets."""
+    insufficiency = _insufficiency(recordings)
+    if insufficiency:
+        return _undiagnosed(insufficiency, notes)
     for recording in recordings:
         check_clocks(recording, parameters.rotation_dvl_from_body)
     available = frozenset.intersection(*(recording.available for recording in recordings))
-    untestable = {name: why for name, effect in effects.items() if (why := _lacks(effect, available, recordings))}
+    untestable = {name: why for name, effect in effects.items() if (why := _missing(effect, available, recordings))}
     try:
         selection = select(
             recordings,
@@ -105,41 +105,41 @@ def diagnose_recordings(
             {name: effect for name, effect in effects.items() if name not in untestable},
         )
     except TooFewBinsError as error:
-        return _nothing_to_say(_too_short(error.samples, sum(each.seconds for each in recordings)), notes)
+        return _undiagnosed(_too_short(error.samples, sum(each.seconds for each in recordings)), notes)
     testable = selection.testable
     _check_bounds(selection)
-    selection, rest = without_replaceable(selection)
-    residuals = held_out(selection, rest)
+    selection, unexplained = without_replaceable(selection)
+    residuals = held_out(selection, unexplained)
     gap = measure_gap(selection, residuals)
     # what one stretch alone determines, as a clock jump in the only turn, is not tested by leaving it out
     if selection.selected and gap.after**2 - gap.left_open**2 >= gap.before**2:
         selection = selection.without(selection.fit.values)
-        rest = unexplained(selection.fitter, selection.fit)
-        residuals = held_out(selection, rest)
+        unexplained = find_unexplained(selection.fitter, selection.fit)
+        residuals = held_out(selection, unexplained)
         gap = measure_gap(selection, residuals)
     covariance, times = covariance_of(selection)
     gap = with_closure(gap, selection, covariance, residuals)
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
-    verdict = _verdict(selection, rest, gap, len(visible) / len(testable))
-    if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # the unknown cause may contribute
-        moved = moved_by(selection.fitter.problem, selection.fit, rest)
-        covariance = covariance + np.outer(moved, moved)
+    verdict = _verdict(selection, unexplained, gap, len(visible) / len(testable))
+    if verdict is DiagnosisVerdict.UNKNOWN and unexplained.found:  # the unknown cause may contribute
+        shift = nuisance_shift(selection.fitter.problem, selection.fit, unexplained)
+        covariance = covariance + np.outer(shift, shift)
     covariance = with_observable(selection.fitter.problem, selection.fit, covariance)
-    unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)
-    covariance = with_moved(selection.fit, covariance, selection.moved)
+    unchanged, covariance = covariance, with_ambiguity(selection.fit, covariance, selection.trade_off)
+    covariance = with_changes(selection.fit, covariance, selection.changes)
     found = tuple(
-        _found(selection, each, covariance, unmoved, times, len(testable), gap) for each in selection.selected
+        _found_effect(selection, each, covariance, unchanged, times, len(testable), gap) for each in selection.selected
     )
-    columns = rest.columns
-    if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and rest.found):
+    columns = unexplained.columns
+    if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and unexplained.found):
         columns = selection.fit.columns[:, :, 6:]
     is_gap = verdict in (DiagnosisVerdict.KNOWN, DiagnosisVerdict.AMBIGUOUS, DiagnosisVerdict.UNKNOWN)
     hypothesis = selection.fit.hypothesis
     calibration = zip([*hypothesis.phi, *hypothesis.scale], np.sqrt(np.diag(covariance)[:6]).tolist(), strict=True)
     return Diagnosis(
         verdict=verdict,
-        reasons=_reasons(verdict, gap, found, rest, visible, len(testable)),
+        reasons=_reasons(verdict, gap, found, unexplained, visible, len(testable)),
         gap=gap,
         effects=found,
         noise=tuple(noise_findings(selection.fitter, selection.fit)),
@@ -148,7 +148,7 @@ def diagnose_recordings(
         minimum_detectable=detectable,
         next_steps=_next_steps(verdict, selection.selected, testable, untestable, detectable),
         notes=tuple(notes),
-        series=collect_series(selection, residuals, rest, covariance) if with_series else None,
+        series=collect_series(selection, residuals, unexplained, covariance) if with_series else None,
         calibration=tuple(around(float(value), std) for value, std in calibration),
         compared_axes=_compared_axes(selection),
         recordings=tuple((recording.name, recording.first_ns) for recording in recordings),
@@ -172,7 +172,7 @@ def _check_bounds(selection: EffectSelection) -> None:
             )
 
 
-def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:
+def _missing(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:
     """Return the inputs that an effect needs and recordings lack, '' if none."""
     lacking = [need.value for need in effect.needs - available]
     if effect.relative_to_first and len(recordings) < 2:
@@ -181,6 +181,7 @@ def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequen
 
 
 def _compared_axes(selection: EffectSelection) -> str:
+    """Return the compared axes in words."""
     problem = selection.fitter.problem
     axes = "".join(name for name, measured in zip("xyz", problem.measured, strict=True) if measured)
     if len(axes) == 3:
@@ -189,7 +190,7 @@ def _compared_axes(selection: EffectSelection) -> str:
     return f"{axes} of the body" if in_body else f"{axes} of the body held level" if axes == "xy" else f"{axes} (ENU)"
 
 
-def _says_nothing(recordings: Sequence[RecordedStreams]) -> Reason | None:
+def _insufficiency(recordings: Sequence[RecordedStreams]) -> Reason | None:
     """Return the reason against diagnosing recordings. Return None if there is none."""
     seconds = sum(recording.seconds for recording in recordings)
     samples = sum(min(len(recording.dvl.time), len(recording.reference.time)) for recording in recordings)
@@ -206,7 +207,8 @@ def _too_short(samples: int, seconds: float) -> Reason:
     return finding("GAP_TOO_SHORT", samples=samples, seconds=seconds, wanted=SETTINGS.min_seconds)
 
 
-def _nothing_to_say(why: Reason, notes: Sequence[str]) -> Diagnosis:
+def _undiagnosed(why: Reason, notes: Sequence[str]) -> Diagnosis:
+    """Return a diagnosis without numbers, for data that cannot answer."""
     nan = float("nan")
     return Diagnosis(
         verdict=DiagnosisVerdict.INSUFFICIENT_EXCITATION,
@@ -232,10 +234,11 @@ CODES = {
 }
 
 
-def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
-    if matters(selection.fitter.problem, selection.fit, rest):
+def _verdict(selection: EffectSelection, unexplained: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
+    """Return the verdict; a systematic residual or a failure on held-out data makes it unknown."""
+    if is_predictive(selection.fitter.problem, selection.fit, unexplained):
         return DiagnosisVerdict.UNKNOWN
-    if gap.fails_elsewhere:
+    if gap.fails_held_out:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected and gap.closure < MATERIAL:
         return DiagnosisVerdict.UNKNOWN
@@ -258,7 +261,7 @@ def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: in
         at = 6 + sum(len(fit.hypothesis.parameters_of(e)) for e in fit.effects[: names.index(effect.name)])
     else:
         at = fit.columns.shape[2]
-        columns.append(problem.columns(fit.hypothesis, fit.seen, effect, somewhere(effect, problem)))
+        columns.append(problem.columns(fit.hypothesis, fit.seen, effect, default_values(effect, problem)))
         std.append(np.full(columns[-1].shape[2], 1e6))
     white = fit.noise.whiten(np.concatenate(columns, axis=2))
     prior = np.concatenate(std)
@@ -273,15 +276,16 @@ def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:
     return any(size <= VISIBLE_TIMES_TYPICAL * typical[name] for name, size in sizes.items())
 
 
-def _found(
+def _found_effect(
     selection: EffectSelection,
     selected: Selected,
     covariance: Array,
-    unmoved: Array,
+    unchanged: Array,
     times: Times,
     n_tested: int,
     gap: Gap,
 ) -> FoundEffect:
+    """Return a selected effect with intervals of its sizes and times."""
     fit, effect = selection.fit, selected.effect
     stds = np.sqrt(np.diag(covariance))[6:].tolist()
     by_recording: dict[int, dict[str, Triple]] = {}
@@ -298,7 +302,7 @@ def _found(
     }
     names = [recording.name for recording in selection.fitter.problem.recordings]
     together = _weighted_mean(list(ordered.values())) if len(ordered) > 1 else next(iter(ordered.values()))
-    is_of_each = effect.of_the_day and len(names) > 1
+    is_of_each = effect.per_recording and len(names) > 1
     return FoundEffect(
         effect.name,
         selected.equivalent,
@@ -306,7 +310,7 @@ def _found(
         closure_alone(selection, gap, effect.name),
         min(1.0, float(np.exp(selected.log_p)) * n_tested),
         {names[recording]: parameters for recording, parameters in ordered.items()} if is_of_each else {},
-        _known_together(selection, unmoved, selected),
+        _known_together(selection, unchanged, selected),
     )
 
 
@@ -316,7 +320,7 @@ def _known_together(selection: EffectSelection, covariance: Array, selected: Sel
     if LAG in fit.values:  # a lag absorbs part of the delay
         return None
     if name == ARM and others and not {*TWO_CLOCKS} & fit.values.keys():
-        return opened_combination(fit, covariance, selection.opened)
+        return ambiguous_combination(fit, covariance, selection.trade_off)
     clocks = [name] if ARM in others else [each for each in others if each in TWO_CLOCKS] if name == ARM else []
     each = [found for clock in clocks if (found := combination(fit, covariance, clock)) is not None]
     return min(each, key=lambda one: one.value[2] - one.value[1], default=None)
@@ -372,7 +376,7 @@ def _reasons(
     verdict: DiagnosisVerdict,
     gap: Gap,
     found: Sequence[FoundEffect],
-    rest: Unexplained,
+    unexplained: Unexplained,
     visible: Sequence[str],
     n_tested: int,
 ) -> tuple[Reason, ...]:
@@ -393,5 +397,5 @@ def _reasons(
     if is_left:
         reasons.append(finding("REST_UNEXPLAINED", rest=1e3 * gap.not_explained))
     if is_unknown:
-        reasons.append(rest.follows if rest.found else finding("REST_FOLLOWS_NOTHING"))
+        reasons.append(unexplained.follows if unexplained.found else finding("REST_FOLLOWS_NOTHING"))
     return tuple(reasons)

@@ -17,8 +17,8 @@ from ..calibration.numerics.block_covariance import student_factor
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.robust import robust_std
 from ..calibration.numerics.tests import Z_ONE_TEST
-from ..calibration.registration.configuration_check import Directions
-from ..calibration.registration.frame_hypotheses import ImuFrame
+from ..calibration.registration.configuration_check import Directions, angle_between
+from ..calibration.registration.frame_hypotheses import ImuFrame, least_turn, nominal_rpy
 from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..messages.decode import turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
@@ -26,7 +26,7 @@ from ..recordings.topic_preview import Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import imu_columns_of
-from .discovery import in_time_of
+from .discovery import as_option, in_time_of
 from .frame_choice import SAME_ANSWER
 
 # Interval over which the speed ahead changes in a turn, s: longer than waves, shorter than a change of throttle.
@@ -98,14 +98,20 @@ def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None
     return SwaySign(float(slopes[0]), std, number)
 
 
-def sign_findings(recordings: Sequence[Survey], topics: Topics, parameters: Parameters) -> Iterator[Reason]:
-    """Yield the finding of axes of the earth, of an inverted sway, or of each open sign that changes the mounting."""
+def sign_findings(
+    recordings: Sequence[Survey], topics: Topics, parameters: Parameters, axes_are_given: bool
+) -> Iterator[Reason]:
+    """Yield the finding of axes of the earth, of an inverted sway, or of each open sign that changes the mounting.
+
+    axes_are_given: the user has set dvl_axes, which confirms all signs.
+    """
     seen = [(one.looks[topics.dvl], one.looks.get(topics.imu)) for one in recordings if topics.dvl in one.looks]
     if not seen:
         return
     first = seen[0][0]
     is_turned = turns_dvl(VELOCITY_TYPES[first.msgtype], first.frame_id, parameters)
-    body_from_message = parameters.rotation_dvl_from_body.T @ (FLU_FROM_FRD if is_turned else np.eye(3))
+    turn = FLU_FROM_FRD if is_turned else np.eye(3)
+    body_from_message = parameters.rotation_dvl_from_body.T @ turn
     frame = ImuFrame(rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, "")
     each, directions = [], Directions()
     for dvl, imu in seen:
@@ -121,27 +127,27 @@ def sign_findings(recordings: Sequence[Survey], topics: Topics, parameters: Para
     mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in seen]).mean(axis=0)
     given = body_from_message @ mean
     straight = np.array([given[0], 0.0, 0.0])
-    if _angle(given, straight) > LIKELY:
+    if math.hypot(given[1], given[2]) >= math.tan(LIKELY) * abs(given[0]):
         return  # no vehicle that travels ahead
     signs = [one for one in each if one is not None and one.sign]
+    axes, other = (FRD, FLU) if is_turned != parameters.is_z_down else (FLU, FRD)
     if signs and all(one.sign < 0 for one in signs):
-        axes = FLU if is_turned != parameters.is_z_down else FRD
-        yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=axes)
+        yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=other)
         return
-    for axis in range(3):
-        other = body_from_message @ (mean * np.where(np.arange(3) == axis, -1.0, 1.0))
-        change = _angle(given, other)
-        if change < SAME_ANSWER or _angle(other, straight) > LIKELY:
+    if axes_are_given:
+        return
+    fitted, flips = least_turn(given, straight) @ body_from_message, 1.0 - 2.0 * np.eye(3)
+    for row in (2,) if signs else (1, 2):
+        # the axis most along this row of the body; negated, the mirrored mounting fits as well
+        along = np.abs(body_from_message[row]).round(6)
+        axis = max(range(3), key=lambda each: (along[each], each == row))
+        mirrored = flips[row][:, None] * fitted * flips[axis]
+        change, also = angle_between(fitted, mirrored), ""
+        if change < SAME_ANSWER:
             continue
-        row = 1 + int(np.argmax(np.abs(given - other)[1:]))
-        if row == 1 and signs:
-            continue
-        is_positive = bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down
-        fields = {"axis": "xyz"[axis], "angle": ("", "yaw", "pitch")[row], "degrees": math.degrees(change)}
-        yield finding("DVL_SIGN_OPEN", **fields, way=WAYS[row][is_positive])
-
-
-def _angle(a: Array, b: Array) -> float:
-    """Return the angle between two directions (3,), rad; π for none."""
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return math.acos(min(1.0, max(-1.0, float(a @ b) / size))) if size > 0.0 else math.pi
+        effect = f"the {('yaw', 'pitch')[row - 1]} changes by {math.degrees(change):.1f}°"
+        if angle_between(mirrored, body_from_message) > LIKELY:
+            mounting = as_option(nominal_rpy(mirrored @ turn))
+            effect, also = f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}"
+        way = WAYS[row][bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down]
+        yield finding("DVL_SIGN_OPEN", axis="xyz"[axis], effect=effect, way=way, axes=axes, also=also)

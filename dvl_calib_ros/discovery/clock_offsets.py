@@ -15,10 +15,11 @@ import numpy as np
 
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.samples import SampleBlock, Stream, Streams, VelocityFrame
+from ..calibration.registration.clock_drift_and_jumps import REPORTED_FROM_S
 from ..calibration.registration.frame_hypotheses import Reading, Readings
 from ..calibration.registration.gauss_newton import white_noise
 from ..calibration.registration.motion_streams import MotionStreams, in_order, make_motion, motion_of
-from ..calibration.registration.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
+from ..calibration.registration.registration import LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
 from ..calibration.registration.unregistrable_clocks import UnregistrableClocks, far_clocks
 from ..calibration.streams.interpolation import ImuColumns
 from ..calibration.streams.screening import unit_quaternions
@@ -102,7 +103,7 @@ def find_clocks(
     for one in each[1:]:
         assert one is not None
         names = {*first.offsets, *one.offsets}
-        if any(abs(first.offsets.get(name, 0.0) - one.offsets.get(name, 0.0)) > ALIKE_S for name in names):
+        if any(abs(first.offsets.get(name, 0.0) - one.offsets.get(name, 0.0)) > REPORTED_FROM_S for name in names):
             return None
     return first
 

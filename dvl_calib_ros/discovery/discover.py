@@ -17,8 +17,8 @@ from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAG
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.robust import median
 from ..calibration.numerics.samples import VelocityFrame
+from ..calibration.registration.configuration_check import BETTER_BY
 from ..calibration.registration.frame_hypotheses import (
-    CLEARLY,
     FITS,
     Agreement,
     ImuFrame,
@@ -38,14 +38,7 @@ from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .axis_signs import sign_findings
 from .clock_offsets import compared_motion, difference_of, on_imu_clock
-from .discovery import (
-    Discovery,
-    Given,
-    as_option,
-    clocks_of_recording,
-    in_time_of,
-    mounting_guessed,
-)
+from .discovery import Discovery, Given, as_option, clocks_of_recording, in_time_of, mounting_guessed
 from .frame_choice import FrameChoice, FrameChooser, declared_reference
 from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed, in_degrees, in_metres
@@ -80,7 +73,8 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
     if found.topics.gnss not in recording.types and not found.contradictions:
-        signs = sign_findings([one.whole(found.topics) for one in recording.each], found.topics, found.parameters)
+        seen_whole = [one.whole(found.topics) for one in recording.each]
+        signs = sign_findings(seen_whole, found.topics, found.parameters, "dvl_axes" in named.parameters)
         return replace(found, contradictions=tuple(signs))
     clocks = clocks_of_recording(recording, found, named)
     if clocks is None:
@@ -169,6 +163,7 @@ class _Search:
         return Topics(dvl, gnss, imu)
 
     def _named(self, role: str, name: str | None) -> str | None:
+        """Return a named topic if the recording has it with a usable type. Raises InputError."""
         if name is None:
             return None
         return topic_choice.checked_topic(
@@ -391,13 +386,7 @@ class _Search:
         is_known = _is_located(placed) and self._known_reference_position(reference) is not None
         return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
 
-    def _use_reading(
-        self,
-        chosen: Agreement,
-        known: Array | None,
-        reference: Look,
-        imu: Look | None,
-    ) -> None:
+    def _use_reading(self, chosen: Agreement, known: Array | None, reference: Look, imu: Look | None) -> None:
         """Write the frames and mounting of a reading into the parameters."""
         reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)
@@ -422,7 +411,7 @@ class _Search:
         if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < FITS:
             residual = self._readings.registered(reading, np.eye(3)).residual
             turned_residual, rotation, *_ = self._readings.registered(reading, None)
-            if self._readings.without_noise(turned_residual) < CLEARLY * self._readings.without_noise(residual):
+            if self._readings.without_noise(turned_residual) < BETTER_BY * self._readings.without_noise(residual):
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
@@ -479,6 +468,7 @@ class _Search:
         self._found.append(f"the IMU's data are used {frame.says}: imu_rpy {in_degrees(rpy)}, imu_frame {frame.world}")
 
     def _mounting_found(self, rpy: tuple[float, float, float], why: str) -> None:
+        """Use a mounting (rad) found from the data, and note its source; nothing if it is zero."""
         if not any(rpy):
             return
         self._values["mounting_rpy"] = rpy

@@ -8,6 +8,7 @@ Its likelihood is that of the residual of DVL and reference, see `frame_hypothes
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -23,9 +24,8 @@ from ..calibration.numerics.frames import (
     rpy_from_rotation,
 )
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.registration.configuration_check import DRAWN, angle_between
+from ..calibration.registration.configuration_check import BETTER_BY, DRAWN, angle_between
 from ..calibration.registration.frame_hypotheses import (
-    CLEARLY,
     FITS,
     MEANT_WITHIN,
     Agreement,
@@ -59,6 +59,8 @@ MOUNTING_OTHER, MOUNTING_TURNED, UPSIDE_DOWN = math.log(1 / 50), math.log(1 / 3)
 BASE_Z_DOWN, UNPLACED_BASE_Z_DOWN = math.log(1 / 50), math.log(1 / 500)
 REFERENCE_FRAME_OTHER = math.log(1 / 200)
 REFERENCE_AXES_OTHER = math.log(1 / 50)
+# a twist in the axes of REP-103 though the vehicle is z down
+TWIST_IN_ROS_AXES = math.log(1 / 3)
 # a reference without a declared frame: ENU, the body, NED; other worlds
 UNDECLARED = {"enu": 0.0, "ned": math.log(1 / 3)} | dict.fromkeys(("body", FLU, FRD), math.log(1 / 2))
 OTHER_WORLD = math.log(1 / 50)
@@ -78,6 +80,9 @@ ARM_STD_M, MOST_OF_ARM = 0.1, 12.0
 OVER = -0.9
 # smallest rotation (rad) of a mounting that differs from the body's axes
 TURNED_FROM = math.radians(12.0)
+# what a parameter is about, and words for its values, in the question which of two readings is right
+ASKED = {"base_axes": "base_link", "dvl_axes": "the DVL", "gnss_frame": "the reference", "imu_frame": "the IMU's world"}
+AXES = {FLU: "forward-left-up", FRD: "forward-right-down"}
 # interval (s) over which a twist is compared with the motion of its own pose
 POSE_STEP_S, POSE_LONGEST_S = 0.5, 1.5
 
@@ -243,7 +248,8 @@ class FrameChooser:
             priors = {name: UNDECLARED.get(name, OTHER_WORLD) for name in names}
         else:
             of_body = declared.frame is VelocityFrame.BODY
-            other = dict.fromkeys(("body", turned), REFERENCE_AXES_OTHER) if of_body else {}
+            of_turned = TWIST_IN_ROS_AXES if z_down else REFERENCE_AXES_OTHER
+            other = {"body": REFERENCE_AXES_OTHER, turned: of_turned} if of_body else {}
             priors = {name: other.get(name, REFERENCE_FRAME_OTHER) for name in names} | {declared.name: 0.0}
         shown = twist_axes(reference)
         if shown is not None:
@@ -332,15 +338,9 @@ class FrameChooser:
             other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
             # in which the IMU's frame affects only the lever arm
             in_body = best.reading.in_body and rival.reading.in_body
-            if other_axes or (
-                not in_body
-                and angle_between(fits[best].rotation_dvl_from_body, fits[rival].rotation_dvl_from_body) > SAME_ANSWER
-            ):
-                taken, instead = (
-                    " and ".join(f"{name} {this[name]}" for name in this if one[name] != other[name]) or "the mounting"
-                    for this in (one, other)
-                )
-                reasons += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
+            fitted = [fits[each].rotation_dvl_from_body for each in (best, rival)]
+            if other_axes or (not in_body and angle_between(*fitted) > SAME_ANSWER):
+                reasons += (_ambiguous(one, other, fitted),)
                 break
         turn = fits[best].rotation_dvl_from_body
         if (
@@ -349,7 +349,9 @@ class FrameChooser:
             and not readings.are_axes_mirrored(best.reading, turn, mounting)
         ):
             imu = None if best.reading.in_body else imus[best.reading]
-            reasons += (_mounting_contradicted(mounting.T, turn.T, imu),)
+            mean = self._dvl.values[np.isfinite(self._dvl.values).all(axis=1)].mean(axis=0)
+            travel = FLU_FROM_FRD @ mean if best.reading.turned else mean
+            reasons += (_mounting_contradicted(mounting.T, turn.T, imu, travel),)
         return FrameChoice(best.agreement, imus[best.reading], reasons)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
@@ -363,10 +365,26 @@ class FrameChooser:
         }
 
 
-def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None) -> Reason:
+def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Array]) -> Reason:
+    """Return the finding of two readings, as values of parameters, with the question that decides between them.
+
+    turns: rotation_dvl_from_body (3, 3) of each, which are named if nothing else differs.
+    """
+    differing = [name for name in taken if taken[name] != other[name]]
+    if not differing:
+        differing = ["mounting_rpy"]
+        taken, other = ({"mounting_rpy": as_option(nominal_rpy(turn.T))} for turn in turns)
+    said = [" with ".join(f"{name} {these[name]}" for name in differing) for these in (taken, other)]
+    asked, value = differing[0], other[differing[0]]
+    asking = {"what": ASKED.get(asked, "the mounting"), "axes": AXES.get(value, value), "parameter": asked}
+    return finding("FRAMES_AMBIGUOUS", taken=said[0], other=said[1], first=taken[asked], value=value, **asking)
+
+
+def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None, travel: Array) -> Reason:
     """Return the finding of another mounting; its remedy names what looks the same.
 
     given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
+    travel: (3,) m/s, mean velocity in the DVL. It is ahead with `given` if the heading is wrong, else with `found`.
     """
     rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)
     first = also = ""
@@ -374,9 +392,11 @@ def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None
     is_drawn = abs(math.remainder(about_z, DRAWN)) < MEANT_WITHIN[2]
     if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=MEANT_WITHIN[0]):
         offset = math.degrees(imu.frame.heading_offset + math.remainder(-about_z if imu.z_down else about_z, math.tau))
-        first = (
-            f"set the declination of the compass, here -p heading_offset:={offset:.4g}deg; if the heading is right, "
-        )
+        declination = f"set the declination of the compass, here -p heading_offset:={offset:.4g}deg"
+        if (given @ travel)[0] > (found @ travel)[0]:
+            first = f"{declination}; if the heading is right, "
+        else:
+            also = f"; if the mounting is right, {declination}"
     shares = np.diag(given.T @ found)
     if np.abs(shares).min() > math.cos(TURNED_FROM):  # a half turn
         negated = " and ".join(axis for axis, share in zip("xyz", shares, strict=True) if share < 0.0)
@@ -430,7 +450,7 @@ def twist_axes(look: Look) -> str | None:
     turned = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
     tried = {name: residual(seen) for name, seen in {**turned, "enu": velocity, "ned": velocity @ ENU_FROM_NED}.items()}
     best, second = sorted(tried, key=tried.__getitem__)[:2]
-    if tried[best] > FITS * look.speed or tried[best] > CLEARLY * tried[second]:
+    if tried[best] > FITS * look.speed or tried[best] > BETTER_BY * tried[second]:
         return None
     world = frame_named(look.world, ())
     in_ned = world is not None and world.frame is VelocityFrame.NED

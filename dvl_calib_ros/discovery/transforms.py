@@ -62,6 +62,7 @@ class FrameTree:
         return tree
 
     def _add_urdf(self, text: str) -> None:
+        """Add the fixed joints of a robot description; a missing xyz makes the position nan."""
         try:
             urdf = parse_urdf(Path("/robot_description"), text.encode())
         except InputError as error:

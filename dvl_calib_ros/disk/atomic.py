@@ -157,6 +157,7 @@ def _error_text(error: OSError | ValueError) -> str:
 
 
 def _write_stream(handle: int, content: bytes) -> None:
+    """Write to a standard stream after its earlier output."""
     if handle < 0:
         return
     for stream in (sys.stdout, sys.stderr):
@@ -265,6 +266,7 @@ def _locked(folder: Path) -> Iterator[bool]:
 
 
 def _lock(handle: int, patience_s: float) -> bool:
+    """Lock an open folder, waiting at most `patience_s`. Return whether that succeeded."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
@@ -307,19 +309,19 @@ def _rotate(target: Path, before: Path | None, keep: Keep, is_alone: bool) -> No
     if not stranded:
         return
     inodes = [each.stat().st_ino for each in [*stranded, target]]
-    for each in [each for at, each in enumerate(stranded) if inodes[at] in inodes[:at] + inodes[-1:]]:
+    for each in [each for i, each in enumerate(stranded) if inodes[i] in inodes[:i] + inodes[-1:]]:
         os.unlink(each)  # left by a save that was killed before its rename
         stranded.remove(each)
-    known = _backups(target) if keep is not newest_only else [each for each in [backup_of(target)] if each.exists()]
-    kept = keep([*stranded, *known])
-    for each in {*stranded, *known} - {*kept}:
+    existing = _backups(target) if keep is not newest_only else [each for each in [backup_of(target)] if each.exists()]
+    kept = keep([*stranded, *existing])
+    for each in {*stranded, *existing} - {*kept}:
         with suppress(FileNotFoundError):
             os.unlink(each)
-    places = dict(zip(kept, map(backup_of(target).with_name, _backup_names(target, len(kept))), strict=True))
-    moves = [(each, place) for each, place in places.items() if each != place]
+    targets = dict(zip(kept, map(backup_of(target).with_name, _backup_names(target, len(kept))), strict=True))
+    moves = [(each, place) for each, place in targets.items() if each != place]
     # move each file only to a free name: upward moves from the last on, then downward moves
-    up = [move for move in moves if move[0] in stranded or _number(move[0]) < _number(move[1])]
-    for each, place in [*reversed(up), *(move for move in moves if move not in up)]:
+    upward = [move for move in moves if move[0] in stranded or _number(move[0]) < _number(move[1])]
+    for each, place in [*reversed(upward), *(move for move in moves if move not in upward)]:
         os.replace(each, place)
         with suppress(FileNotFoundError):  # os.replace between two links of one file does nothing
             os.unlink(each)

@@ -34,12 +34,14 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
             self.get_event = events.get_event
 
     def compose_node(self, parent: Any, index: Any) -> Any:
+        """Refuse aliases, which can expand to any size."""
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
             raise yaml.composer.ComposerError(None, None, "write it out, without aliases (*name)", mark)
         return super().compose_node(parent, index)
 
     def compose_mapping_node(self, anchor: Any) -> Any:
+        """Refuse a mapping with the same key twice."""
         node = super().compose_mapping_node(anchor)
         lines: dict[tuple[str, str], int] = {}
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
@@ -108,6 +110,7 @@ def write_json(path: Path, document: Any) -> None:
 
 
 def _finite(value: Any) -> Any:
+    """Replace numbers that are not finite by None, in nested data."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -111,7 +111,7 @@ class EffectParameter:
     """One parameter of an effect.
 
     typical: a relevant size, in `unit`. low, high: bounds. default: value if not given; an effect with all defaults
-    does nothing. linear: the trace is linear in it, with the others fixed. said: displayed name before value and unit,
+    does nothing. linear: the trace is linear in it, with the others fixed. said: text displayed before value and unit,
     '' if the effect's name suffices; None: `name`.
     """
 
@@ -126,7 +126,7 @@ class EffectParameter:
     said: str | None = None
 
     @property
-    def spoken(self) -> str:
+    def display_name(self) -> str:
         """Return the displayed name before value and unit."""
         return self.name if self.said is None else self.said
 
@@ -172,7 +172,7 @@ class Effect(AnyEffect, ABC):
     """A systematic effect: the same motion always gives the same trace.
 
     remedy: what to do about it, as part of a sentence. manoeuvre: motion that makes it observable and distinguishes it
-    from confounded effects. of_the_day: whether its size differs per recording; else it belongs to the vehicle.
+    from confounded effects. per_recording: whether its size differs per recording; else it belongs to the vehicle.
     relative_to_first: whether it is a change from the first of several recordings. again: parameters of a second
     occurrence, searched after a first was found -> those of the first. rarer: parameters searched only if several
     recordings need them. of_velocity: whether the trace depends on the velocity of the motion.
@@ -180,7 +180,7 @@ class Effect(AnyEffect, ABC):
 
     remedy: ClassVar[str] = ""
     manoeuvre: ClassVar[str]
-    of_the_day: ClassVar[bool] = False
+    per_recording: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False
     again: ClassVar[Mapping[str, str]] = {}
     rarer: ClassVar[frozenset[str]] = frozenset()
@@ -200,7 +200,7 @@ class Effect(AnyEffect, ABC):
     def of_the_vehicle(self) -> Effect:
         """Return the effect with one size in all recordings."""
         found = copy(self)
-        vars(found)["of_the_day"] = False
+        vars(found)["per_recording"] = False
         return found
 
     def without(self, names: Collection[str]) -> Effect:
@@ -258,7 +258,7 @@ class EffectWithMemory(Effect):
 class ClockEffect(Effect):
     """A systematic effect on the stamps of one stream."""
 
-    of_the_day = True
+    per_recording = True
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
         """Return the delay (N,) s of the stamps of measurements at times (N,) s since the start; here constant."""

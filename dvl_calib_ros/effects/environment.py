@@ -33,7 +33,7 @@ class WaterLock(Effect):
             "to_s", "s", math.inf, 0.0, math.inf, "when it ends", default=math.inf, linear=False, said="to"
         ),
     )
-    of_the_day = True
+    per_recording = True
     acts_on = ActsOn.MOTION
     of_velocity = False
     needs = frozenset({EffectNeeds.ATTITUDE})
@@ -76,7 +76,7 @@ class HeadingError(Effect):
         ),
     )
     rarer = frozenset({"sin2_rad", "cos2_rad", "rad_per_hour"})
-    of_the_day = True
+    per_recording = True
     acts_on = ActsOn.REFERENCE
     needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("water_lock",)

@@ -34,7 +34,7 @@ class Outliers(NoiseEffect):
         return velocity + hit[:, None] * rng.normal(0.0, values["std_mps"], velocity.shape)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """Return the same with the same probability; the samples hit differ from those of one call."""
+        """Return `disturb` for consecutive batches; the probability is equal, the outliers are other samples."""
         return lambda velocity, motion: self.disturb(velocity, motion, values, rng)
 
 
@@ -51,6 +51,7 @@ class StaleSamples(NoiseEffect):
         last: Array = np.empty((0, 3))
 
         def disturbance(velocity: Array, motion: EffectInput) -> Array:
+            """Replace a share of the samples (N, 3) by the fresh one before them."""
             nonlocal last
             stale = rng.random(len(velocity)) < values["share"]
             known = np.vstack([last, velocity])
@@ -111,6 +112,7 @@ class ColouredReferenceNoise(NoiseEffect):
         last: tuple[float, Array] | None = None
 
         def disturbance(velocity: Array, motion: EffectInput) -> Array:
+            """Add first-order Gauss-Markov noise to samples (N, 3) m/s."""
             nonlocal last
             noise = values["std_mps"] * rng.standard_normal(velocity.shape)
             if tau > 0.0:

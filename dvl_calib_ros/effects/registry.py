@@ -77,12 +77,13 @@ def all_effects() -> tuple[AnyEffect, ...]:
     for point in entry_points(group=ENTRY_POINTS):
         effect = _plugged_in(point)
         if effect.name in effects:
-            raise InputError(f"{_named(point)}: there is an effect {effect.name!r} already; give it another name")
+            raise InputError(f"{_label(point)}: there is an effect {effect.name!r} already; give it another name")
         effects[effect.name] = effect
     return tuple(effects.values())
 
 
 def _plugged_in(point: EntryPoint) -> AnyEffect:
+    """Return the effect of an entry point. Raises InputError for any fault of its package."""
     try:
         kind = point.load()
         if not (isinstance(kind, type) and issubclass(kind, Effect | NoiseEffect)):
@@ -94,7 +95,7 @@ def _plugged_in(point: EntryPoint) -> AnyEffect:
         _check_stage(effect)
     except Exception as error:  # any fault of a foreign package
         raise InputError(
-            f"{_named(point)}: cannot be used ({type(error).__name__}: {error}); repair or uninstall that package"
+            f"{_label(point)}: cannot be used ({type(error).__name__}: {error}); repair or uninstall that package"
         ) from error
     return effect
 
@@ -117,7 +118,7 @@ def _check_stage(effect: AnyEffect) -> None:
         raise TypeError(f"acts_on is {listed} for a subclass of {kind.__name__}, not {effect.acts_on}")
 
 
-def _named(point: EntryPoint) -> str:
+def _label(point: EntryPoint) -> str:
     package = f" of package {point.dist.name}" if point.dist else ""
     return f"effect plug-in {point.name!r}{package}"
 
@@ -129,11 +130,12 @@ NOISE_EFFECTS: Registry[NoiseEffect] = Registry(NoiseEffect)  # type: ignore[typ
 def effect_table() -> str:
     """Return every effect with its parameters, in Markdown."""
     lines = ["| effect | is | parameters | needs | looks like |", "|---|---|---|---|---|"]
-    lines += [_row(effect) for effect in chain(EFFECTS.values(), NOISE_EFFECTS.values())]
+    lines += [_table_row(effect) for effect in chain(EFFECTS.values(), NOISE_EFFECTS.values())]
     return "\n".join(lines) + "\n"
 
 
-def _row(effect: AnyEffect) -> str:
+def _table_row(effect: AnyEffect) -> str:
+    """Return an effect's row of the table, in Markdown."""
     by_unit = [
         f"{_codes(parameter.name for parameter in group)} {unit}"
         for unit, group in groupby(effect.parameters, lambda parameter: parameter.unit)

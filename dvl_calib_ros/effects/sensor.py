@@ -60,7 +60,7 @@ class ScaleDrift(Effect):
             "rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour", said="rate"
         ),
     )
-    of_the_day = True
+    per_recording = True
     acts_on = ActsOn.DVL
     confounded_with = ("misalignment_drift",)
 
@@ -79,7 +79,7 @@ class MisalignmentDrift(MountingEffect):
     parameters = along_axes(
         "rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour", linear=False
     )
-    of_the_day = True
+    per_recording = True
     confounded_with = ("scale_drift",)
 
     def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -112,7 +112,7 @@ class MountingMoved(MountingEffect):
     remedy = "the DVL has been moved between the recordings: calibrate each day by itself"
     manoeuvre = "straight legs that speed up and slow down, in each recording"
     parameters = along_axes("rad", "rad", 0.02, 1.5, "change of φ about the DVL's axis {}", linear=False)
-    of_the_day = True
+    per_recording = True
     relative_to_first = True
 
     def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -129,7 +129,7 @@ class SoundSpeedMoved(Effect):
     manoeuvre = "straight legs, in each recording"
     parameters = (EffectParameter("ratio", "1", 0.005, -0.2, 0.2, "change of the scale-factor error"),)
     acts_on = ActsOn.DVL
-    of_the_day = True
+    per_recording = True
     relative_to_first = True
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:

@@ -28,8 +28,8 @@ class _DvlClock(ClockEffect):
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return v(t - late) - v(t), body frame."""
-        late = self.late(motion.elapsed, values)
-        return delayed(motion.time, motion.velocity_body, late) - motion.velocity_body
+        delay = self.late(motion.elapsed, values)
+        return delayed(motion.time, motion.velocity_body, delay) - motion.velocity_body
 
 
 class DvlTimeOffset(_DvlClock):
@@ -102,8 +102,8 @@ class ReferenceTimeOffset(ClockEffect):
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return g(t) - g(t - τ) of the reference velocity g in its recorded frame, rotated to the body."""
         reference = _in_reference_frame(motion, motion.velocity_body)
-        late = self.late(motion.elapsed, values)
-        return _in_body(motion, reference - delayed(motion.time, reference, late))
+        delay = self.late(motion.elapsed, values)
+        return _in_body(motion, reference - delayed(motion.time, reference, delay))
 
 
 class AttitudeTimeOffset(ClockEffect):
@@ -120,10 +120,10 @@ class AttitudeTimeOffset(ClockEffect):
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return v - R(t - τ)ᵀ R(t) v; a body-frame reference needs no attitude, except for a lever arm."""
-        attitude, late = motion.attitude, self.late(motion.elapsed, values)
-        if motion.reference_frame is VelocityFrame.BODY or len(motion.time) < 2 or not late.any():
+        attitude, delay = motion.attitude, self.late(motion.elapsed, values)
+        if motion.reference_frame is VelocityFrame.BODY or len(motion.time) < 2 or not delay.any():
             return np.zeros_like(motion.velocity_body)
-        at = np.clip(motion.time - late, motion.time[0], motion.time[-1])
+        at = np.clip(motion.time - delay, motion.time[0], motion.time[-1])
         then = Slerp(motion.time, Rotation.from_matrix(attitude))(at).as_matrix()
         earth = np.einsum("nij,nj->ni", attitude, motion.velocity_body)
         return motion.velocity_body - np.einsum("nji,nj->ni", then, earth)

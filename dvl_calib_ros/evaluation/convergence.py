@@ -59,11 +59,11 @@ def squared_errors(
                 rotations = [
                     align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for end in ends
                 ]
-                off = np.stack([_rotation_errors(each, truth) for each in rotations])
+                errors = np.stack([_rotation_errors(each, truth) for each in rotations])
             except Exception as error:  # only this curve's share of the run is lost
                 failures.append(Failure.of(error, name, run.name))
                 continue
-            by_key[name, std] = (off**2).mean(axis=1)
+            by_key[name, std] = (errors**2).mean(axis=1)
     missing = np.full((len(TIMES_S), 3), np.nan)
     return np.stack([by_key.get(key, missing) for key in curve_keys(models)])
 

@@ -143,19 +143,20 @@ def cross_check(
 
 
 def _notes_of(replayed: _Replayed, models: Sequence[str]) -> Iterator[str]:
-    """Yield the notes on the models asked for; if all are, only on the selected one."""
-    asked = {replayed.selected[0]} if set(models) == set(BY_VELOCITY) else set(models)
-    others = tuple(f"{name}: " for name in MODELS if name not in asked)
+    """Yield the notes on the requested models; if all are requested, only on the selected one."""
+    requested = {replayed.selected[0]} if set(models) == set(BY_VELOCITY) else set(models)
+    others = tuple(f"{name}: " for name in MODELS if name not in requested)
     yield from (note for note in (*replayed.failed, *replayed.notes) if not note.startswith(others))
 
 
 def _with_own_delay(terms: Terms, verified: _Replayed) -> Terms:
-    """Replace the delay by the verifying bag's, because clocks are synchronised anew in each recording."""
+    """Replace the delay by the verifying bag's, because each recording synchronises its clocks differently."""
     delayed = next(iter(verified.delayed.values()), None)
     return terms if delayed is None else terms._replace(time_offset=delayed.time_offset)
 
 
 def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> float:
+    """Return the velocity RMSE (m/s) on the verifying bag, with the delay corrected."""
     if verified.recording is None:
         return float("nan")
     every = np.arange(len(verified.recording.dvl.times))
@@ -247,8 +248,8 @@ BEYOND = ("lever_arm_x", "lever_arm_y", "lever_arm_z", "time_offset")
 def _terms(estimate: Estimate) -> Terms:
     """Return the corrections by an estimate."""
     errors = MODELS[estimate.model].error_terms_from_state @ estimate.state
-    *arm, late = (estimate.state_of(name) for name in BEYOND)
-    return Terms(errors, np.array(arm), late)
+    *arm, delay = (estimate.state_of(name) for name in BEYOND)
+    return Terms(errors, np.array(arm), delay)
 
 
 def cross_check_document(check: CrossCheck) -> dict[str, Any]:

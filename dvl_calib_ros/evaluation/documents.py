@@ -23,22 +23,22 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
     e = evaluation
     names = [each.name for each in e.sets]
     return {
-        "avg_vrmse": _table(names, e.columns, e.seed_mean),
-        "mean": _row(e.columns, e.set_mean),
+        "avg_vrmse": _by_name(names, e.columns, e.seed_mean),
+        "mean": _by_column(e.columns, e.set_mean),
         "published": {name: dict(e.published[name]) for name in names},
-        "ratio": _table(names, e.columns, e.ratio),
+        "ratio": _by_name(names, e.columns, e.ratio),
         "avg_vrmse_per_seed": {
             name: {column: values.tolist() for column, values in zip(e.columns, rows, strict=True)}
             for name, rows in zip(names, e.avg_vrmse, strict=True)
         },
         "avg_vrmse_by_time": {
-            name: {_window(w): _row(e.columns, row) for w, row in zip(e.windows_s, rows, strict=True)}
+            name: {_window(w): _by_column(e.columns, row) for w, row in zip(e.windows_s, rows, strict=True)}
             for name, rows in zip(names, e.seed_mean_by_time, strict=True)
         },
         "coverage": _coverage(e.coverage),
         "coverage_of_all": _coverage(e.coverage_of_all),
-        "each": _each(e.each, e.columns),
-        "single_heading": _each(e.single_heading, e.columns),
+        "each": _single_run_document(e.each, e.columns),
+        "single_heading": _single_run_document(e.single_heading, e.columns),
         "held_out": [vars(each) for each in e.held_out],
         "baselines": {
             name: {**dict(zip(names, values.tolist(), strict=True)), "mean": float(values.mean())}
@@ -67,6 +67,7 @@ def evaluation_csv(evaluation: Evaluation) -> str:
 
 
 def _csv_rows(e: Evaluation) -> Iterator[Sequence[Any]]:
+    """Yield the CSV's rows: sets, calibration times, then calibrations on each run."""
     for each, by_column, published in zip(e.sets, e.avg_vrmse, e.published_table, strict=True):
         where = ("sets", each.name, each.calibration_run, 0.0, each.window_s)
         yield from _per_seed(e, where, by_column, published)
@@ -81,6 +82,7 @@ def _csv_rows(e: Evaluation) -> Iterator[Sequence[Any]]:
 def _per_seed(
     e: Evaluation, where: Sequence[Any], by_column: Array, published: Array | None = None
 ) -> Iterator[Sequence[Any]]:
+    """Yield one CSV row per column and seed. by_column: (C, seeds) m/s. published: (C,) m/s."""
     for index, column in enumerate(e.columns):
         known = "" if published is None or np.isnan(published[index]) else float(published[index])
         for seed, value in zip(e.seeds, by_column[index].tolist(), strict=True):
@@ -92,43 +94,45 @@ def _window(seconds: float | None) -> str:
     return "all" if seconds is None else f"{seconds:g}"
 
 
-def _row(columns: Sequence[str], values: Array) -> dict[str, float]:
+def _by_column(columns: Sequence[str], values: Array) -> dict[str, float]:
     return dict(zip(columns, values.tolist(), strict=True))
 
 
-def _table(names: Sequence[str], columns: Sequence[str], values: Array) -> dict[str, dict[str, float]]:
-    return {name: _row(columns, row) for name, row in zip(names, values, strict=True)}
+def _by_name(names: Sequence[str], columns: Sequence[str], values: Array) -> dict[str, dict[str, float]]:
+    return {name: _by_column(columns, row) for name, row in zip(names, values, strict=True)}
 
 
 def _coverage(coverage: Sequence[Coverage]) -> dict[str, Any]:
+    """Return plain data of the coverage by model."""
     return {
         each.model: {
             "errors": each.n_errors,
             "normalised_rms": each.normalised_rms,
-            "within_68": {"pooled": each.pooled_68, **_row(each.state_names, each.within_68)},
-            "within_95": {"pooled": each.pooled_95, **_row(each.state_names, each.within_95)},
-            "mean_error": _row(each.state_names, each.mean_error),
-            "rms_error": _row(each.state_names, each.rms_error),
-            "mean_std": _row(each.state_names, each.mean_std),
+            "within_68": {"pooled": each.pooled_68, **_by_column(each.state_names, each.within_68)},
+            "within_95": {"pooled": each.pooled_95, **_by_column(each.state_names, each.within_95)},
+            "mean_error": _by_column(each.state_names, each.mean_error),
+            "rms_error": _by_column(each.state_names, each.rms_error),
+            "mean_std": _by_column(each.state_names, each.mean_std),
         }
         for each in coverage
     }
 
 
-def _each(study: EachStudy | None, columns: Sequence[str]) -> dict[str, Any] | None:
+def _single_run_document(study: EachStudy | None, columns: Sequence[str]) -> dict[str, Any] | None:
+    """Return plain data of the calibrations on each single run; None if they were not made."""
     if study is None:
         return None
     runs = [
         {
             **vars(run),
-            "avg_vrmse": _row(columns, scores),
-            "yaw_observed": _row(columns[1:], observed),
+            "avg_vrmse": _by_column(columns, scores),
+            "yaw_observed": _by_column(columns[1:], observed),
         }
         for run, scores, observed in zip(study.runs, study.seed_mean, study.yaw_observed, strict=True)
     ]
     return {
         "runs": runs,
-        "median": _row(columns, study.median()),
-        "median_manoeuvring": _row(columns, study.median(MANOEUVRING)),
+        "median": _by_column(columns, study.median()),
+        "median_manoeuvring": _by_column(columns, study.median(MANOEUVRING)),
         "coverage": _coverage(study.coverage),
     }

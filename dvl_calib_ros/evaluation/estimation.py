@@ -121,7 +121,7 @@ def estimate(
     has_attitude = data.run.rotation_enu_from_body is not None
     able = [name for name in models if has_attitude or MODELS[name].needs is not Needs.ATTITUDE]
     try:
-        return _estimate(able, data, parameters, ends)
+        return _estimate_all(able, data, parameters, ends)
     except Exception:  # repeat individually, so that an exception affects only its own variant
         return {name: _estimate_by_variant(name, data, parameters, ends, failures) for name in able}
 
@@ -137,7 +137,7 @@ def _estimate_by_variant(
         one_variant = slice(index, index + 1)
         one = replace(data, velocity_dvl=data.velocity_dvl[one_variant], reference=data.reference[one_variant])
         try:
-            state = _estimate([name], one, parameters, ends)[name]
+            state = _estimate_all([name], one, parameters, ends)[name]
         except Exception as error:
             failures.append(Failure.of(error, name, data.run.name, index))
             continue
@@ -145,9 +145,10 @@ def _estimate_by_variant(
     return GaussianState(x, p)
 
 
-def _estimate(
+def _estimate_all(
     models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int]
 ) -> Mapping[str, GaussianState]:
+    """Run `estimate` for models that are usable with these data."""
     variants = aligned(data, parameters)
     found = {name: _estimate_fed(name, data, parameters, ends) for name in models if MODELS[name].estimator}
     for needs in Needs:

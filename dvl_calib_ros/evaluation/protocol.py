@@ -170,6 +170,7 @@ def load_folder(folder: Path, partial: bool = False) -> tuple[dict[str, Trajecto
 
 
 def _check_missing(folder: Path, missing: list[str], partial: bool) -> None:
+    """Raise InputError for missing trajectories, unless `partial` and enough others."""
     files = ", ".join(f"{name}_dvl.csv" for name in missing)
     needed = [each.calibration_run for each in SETS]
     enough = not set(needed) & set(missing) and len(TRAJECTORIES) - len(missing) >= len(needed) + MIN_OTHERS
@@ -180,6 +181,7 @@ def _check_missing(folder: Path, missing: list[str], partial: bool) -> None:
 
 
 def _load(folder: Path, name: str, shortest_s: float) -> Trajectory:
+    """Load a trajectory, at least this long. Raises InputError for implausible speeds or a short file."""
     path = folder / f"{name}_dvl.csv"
     time, velocity = _read_whole_file(path, "m/s")
     fast = np.linalg.norm(velocity, axis=1) > MAX_SPEED
@@ -206,6 +208,7 @@ def _read_whole_file(path: Path, unit: str) -> tuple[Array, Array]:
 
 
 def _with_attitude(run: Trajectory, path: Path) -> Trajectory:
+    """Add the attitude of a file to a run. Raises InputError for implausible angles or other times."""
     time, rpy = _read_whole_file(path, "rad")
     wide = (np.abs(rpy) > LARGEST_ANGLES + 1e-9).any(axis=1)
     if wide.any():
@@ -240,6 +243,7 @@ def own_trajectories() -> dict[str, Trajectory]:
 
 
 def _simulated(name: str, kind: str, seconds: float, with_attitude: bool) -> Trajectory:
+    """Simulate a trajectory of this kind and length, with its own seed."""
     rng = np.random.default_rng([_SEED, *name.encode()])
     skipped_s = float(np.floor(rng.uniform(0.0, 100.0)))  # so that two of one kind differ
     motion = make_motion(kind, skipped_s + seconds, _MOTION_RATE_HZ)

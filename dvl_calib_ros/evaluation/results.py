@@ -37,14 +37,14 @@ class Improvement(NamedTuple):
 
     @staticmethod
     def of(models: Sequence[str], corrected: Array, uncorrected: Array) -> Improvement:
-        """Compute from corrected (M, ...) and uncorrected (...) errors of M models, where both are known."""
-        found = []
+        """Return the improvement by the best of M models, from corrected (M, ...) and uncorrected (...) errors, m/s."""
+        candidates = []
         for name, after in zip(models, corrected, strict=True):
-            both = np.isfinite(after) & np.isfinite(uncorrected)
-            if both.any():
-                before = np.broadcast_to(uncorrected, both.shape)[both]
-                found.append(Improvement(name, float(before.mean()), float(after[both].mean())))
-        return min(found, key=lambda each: each.after - each.before, default=Improvement("", math.nan, math.nan))
+            known = np.isfinite(after) & np.isfinite(uncorrected)
+            if known.any():
+                before = np.broadcast_to(uncorrected, known.shape)[known]
+                candidates.append(Improvement(name, float(before.mean()), float(after[known].mean())))
+        return min(candidates, key=lambda each: each.after - each.before, default=Improvement("", math.nan, math.nan))
 
     @property
     def verdict(self) -> str:

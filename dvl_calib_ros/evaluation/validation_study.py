@@ -102,7 +102,8 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     def outcome(
         models: Sequence[str], stretch: SensorData, windows: Sequence[float | None], own_window: float | None
     ) -> RunOutcome:
-        others = _others(moments, stretch.run.name)
+        """Calibrate on a stretch after each window, and evaluate on all other runs."""
+        others = _moments_of_others(moments, stretch.run.name)
         ends = [stretch.run.first(window) for window in windows]
         return _calibrate_once(models, stretch, ends, windows.index(own_window), others, procedure, failures)
 
@@ -113,7 +114,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     baselines = np.array(
         [
             [
-                float(vrmse(_others(moments, each.calibration_run), matrices).mean())
+                float(vrmse(_moments_of_others(moments, each.calibration_run), matrices).mean())
                 for matrices in _baselines(data(each.calibration_run), each.window_s, failures)
             ]
             for each in procedure.sets
@@ -128,7 +129,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
         by_set=by_set,
         each=tuple(outcome(procedure.studied, data(name), [None], None) for name in with_attitude),
         single_heading=tuple(
-            outcome(procedure.studied, _part(data(name), start, end), [None], None) for name, start, end in legs
+            outcome(procedure.studied, _part_of_data(data(name), start, end), [None], None) for name, start, end in legs
         ),
         baselines=baselines,
         convergence=np.stack(
@@ -161,7 +162,7 @@ def _of_seed(failures: Sequence[Failure], seed: int) -> tuple[Failure, ...]:
     return tuple(replace(each, seed=seed) for each in failures)
 
 
-def _others(moments: Mapping[str, RunMoments], name: str) -> RunMoments:
+def _moments_of_others(moments: Mapping[str, RunMoments], name: str) -> RunMoments:
     return RunMoments.stack([each for other, each in moments.items() if other != name])
 
 
@@ -203,7 +204,7 @@ def references(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) 
     )
 
 
-def _part(data: SensorData, start: int, end: int) -> SensorData:
+def _part_of_data(data: SensorData, start: int, end: int) -> SensorData:
     return SensorData(data.run.part(start, end), data.velocity_dvl[:, start:end], data.reference[:, start:end])
 
 
@@ -256,16 +257,17 @@ def runs_with_attitude(runs: Mapping[str, Trajectory]) -> list[str]:
 
 def each_runs(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
     """Return the calibration runs of `SeedOutcome.each`."""
-    return tuple(_described(runs[name], 0, len(runs[name].time)) for name in runs_with_attitude(runs))
+    return tuple(_calibration_run(runs[name], 0, len(runs[name].time)) for name in runs_with_attitude(runs))
 
 
 def single_headings(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
     """Return the calibration runs of `SeedOutcome.single_heading`."""
     legs = [leg for name in runs_with_attitude(runs) for leg in _legs(runs[name])]
-    return tuple(_described(runs[name], start, end) for name, start, end in legs)
+    return tuple(_calibration_run(runs[name], start, end) for name, start, end in legs)
 
 
-def _described(run: Trajectory, start: int, end: int) -> CalibrationRun:
+def _calibration_run(run: Trajectory, start: int, end: int) -> CalibrationRun:
+    """Return a stretch of samples start .. end - 1 with its times and spread of headings."""
     rotation = run.rotation_enu_from_body
     assert rotation is not None  # only runs with attitude get here
     from_s, to_s = (float(run.time[at] - run.time[0]) for at in (start, end - 1))
@@ -395,6 +397,7 @@ def _for_procedure(parameters: Parameters) -> tuple[Parameters, tuple[str, ...]]
 
 
 def _coverage(models: Sequence[str], outcomes: Sequence[RunOutcome]) -> tuple[Coverage, ...]:
+    """Return the coverage of the intervals of every model, over all runs."""
     found = []
     for name in models:
         ran = [each for each in outcomes if name in each.errors]

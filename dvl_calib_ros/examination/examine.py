@@ -88,7 +88,7 @@ class Examination(Answering):
 
     @property
     def has_reference(self) -> bool:
-        """Whether there is a reference velocity."""
+        """Return whether there is a reference velocity."""
         return any(content.role == "reference" for content in self.contents)
 
     @property
@@ -168,7 +168,8 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
     reasons = () if verification is None else tuple(verification.reasons)
-    findings = [each for each in findings if each.numbers.get("says") not in reasons]  # said once
+    said = set(map(str, reasons))
+    findings = [each for each in findings if str(each.numbers.get("says")) not in said]  # said once
     judged = Severity.REJECT if verification is None else verification.verdict
     if judged is not Severity.REJECT:  # the replay is usable, so no finding prevents a calibration
         findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]
@@ -182,7 +183,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         discovery,
         tuple(findings),
         float(np.median(np.linalg.norm(velocity, axis=1))) if len(velocity) else 0.0,
-        () if replayed is None or "reference" not in streams else _shown(replayed),
+        () if replayed is None or "reference" not in streams else _observability(replayed),
         recording.notes,
         judged,
         reasons,
@@ -254,6 +255,7 @@ def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | No
 
 
 def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> Content:
+    """Return name, type, rate and reported σ of a topic, as text."""
     variances = topic.variances[np.isfinite(topic.variances).all(axis=1)]
     if role == "imu":
         covariance = ""
@@ -385,7 +387,7 @@ class Shown:
     needs: str
 
 
-def _shown(replayed: Replayed) -> tuple[Shown, ...]:
+def _observability(replayed: Replayed) -> tuple[Shown, ...]:
     """Return the observability of roll, pitch, yaw and scale; nothing if no sample was usable."""
     result = replayed.result
     if not result.estimate.used:
@@ -395,6 +397,7 @@ def _shown(replayed: Replayed) -> tuple[Shown, ...]:
 
 
 def _one_shown(found: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
+    """Return one quantity with its σ, progress to the goal, and the missing motion."""
     if found.name == "scale":
         unit, prior = 100.0, parameters.initial_std_scale
     else:

@@ -172,15 +172,15 @@ def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Reason]:
     variances = topic.variances[used]
     if np.isnan(variances).any() or (variances != variances[0]).any():
         return []
-    claimed = float(np.sqrt(variances[0].mean()))
-    shown = shown_noise(topic.values[used])
+    reported = float(np.sqrt(variances[0].mean()))
+    measured = shown_noise(topic.values[used])
     if is_dvl:
-        wrong = claimed > CLAIMS_TOO_MUCH * max(shown, 1e-4) or (
-            claimed < CLAIMS_TOO_LITTLE * shown and shown > QUIET and interval_s(topic) <= 0.25
+        wrong = reported > CLAIMS_TOO_MUCH * max(measured, 1e-4) or (
+            reported < CLAIMS_TOO_LITTLE * measured and measured > QUIET and interval_s(topic) <= 0.25
         )
     else:
-        wrong = not NO_RECEIVER[0] <= claimed <= NO_RECEIVER[1]
-    return [finding("DOCTOR_COVARIANCE", topic=topic.topic, claimed=claimed, shown=shown)] if wrong else []
+        wrong = not NO_RECEIVER[0] <= reported <= NO_RECEIVER[1]
+    return [finding("DOCTOR_COVARIANCE", topic=topic.topic, claimed=reported, shown=measured)] if wrong else []
 
 
 def orientation_findings(imu: Recorded) -> list[Reason]:

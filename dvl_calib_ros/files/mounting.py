@@ -73,7 +73,7 @@ class CalibratedMounting:
 
     @property
     def lever_arm_found(self) -> bool:
-        """Whether the estimated lever arm replaces the configured one."""
+        """Return whether the estimated lever arm replaces the configured one."""
         return self.lever_arm != self.parameters.lever_arm
 
     @property
@@ -148,9 +148,9 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     errors = model.error_terms_from_state @ state.x
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
     arm, position = lever_arm(model, state, parameters.lever_arm), position_in_body(model, state, parameters)
-    at_hand = {"lever_arm": arm, "position": position}
+    local_copy = {"lever_arm": arm, "position": position}
     agree = all(
-        np.allclose(in_result[name], at_hand[name] or in_result[name], rtol=0.0, atol=1e-6) for name in in_result
+        np.allclose(in_result[name], local_copy[name] or in_result[name], rtol=0.0, atol=1e-6) for name in in_result
     )
     if not (angle_between(rotation, saved) < 1e-6 and agree):
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
@@ -158,7 +158,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         raise InputError(
             f"{path}: mounting is for frame {frames[1]!r}, parameters for {parameters.dvl_frame!r}; save it again"
         )
-    doubts += _unobservable(model, state, parameters)
+    doubts += _unobservable_angles(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
     of_scale = None
     if water is not None:
@@ -199,7 +199,8 @@ def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[
     return tuple(str(each["says"]) for each in content.get("doubts", ()) if each["severity"] in wanted)
 
 
-def _unobservable(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
+def _unobservable_angles(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
+    """Return a sentence with 1 σ for each angle that was not observable."""
     entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
     return tuple(
         f"{each.name} ({each.axis}) was not observable in the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
@@ -222,32 +223,32 @@ def calibrated_urdf(
     Raises InputError if its mounting or position differs from the calibration's initial one, unless force is set.
     keep_position: keep the position.
     """
-    now, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
-    begun_with = calibrated.parameters.rotation_dvl_from_body.T
-    if calibrated.turned and now[:, 2] @ begun_with[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
-        corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
+    current, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
+    initial = calibrated.parameters.rotation_dvl_from_body.T
+    if calibrated.turned and current[:, 2] @ initial[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
+        corrected, initial = corrected @ FLU_FROM_FRD, initial @ FLU_FROM_FRD
     known = None if keep_position or calibrated.position is None else np.array(calibrated.position)
     position = mounting.position if known is None else known
-    near = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # a configured position may be rounded
-    is_there = np.abs(mounting.position - position).max() < near
-    if angle_between(now, corrected) < ALREADY and is_there:
+    tolerance = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # a configured position may be rounded
+    is_placed = np.abs(mounting.position - position).max() < tolerance
+    if angle_between(current, corrected) < ALREADY and is_placed:
         return urdf.content
-    if angle_between(now, begun_with) > SAME_MOUNTING and angle_between(now, corrected) > ALREADY and not force:
+    if angle_between(current, initial) > SAME_MOUNTING and angle_between(current, corrected) > ALREADY and not force:
         raise InputError(
-            f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(now))} in {calibrated.base_frame} (joint "
+            f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(current))} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
             f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
             "or write the calibrated one anyway with --force"
         )
     began_at = np.array(calibrated.parameters.lever_arm) + calibrated.parameters.reference_position
-    if not is_there and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
+    if not is_placed and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
         found = f" and found {numbers(_rounded(position))}" if calibrated.lever_arm_found else ""
         raise InputError(
             f"{urdf.path}: has the DVL at {numbers(mounting.position)} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with {numbers(began_at)}{found}; --keep-position "
             "rotates the joint only, --force moves it there"
         )
-    return urdf.moved(mounting, corrected, None if is_there else position)
+    return urdf.moved(mounting, corrected, None if is_placed else position)
 
 
 def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: bool = False) -> bytes:
@@ -469,7 +470,7 @@ def write_calibration(
     """
     if targets.paths:
         calibrated.check_applicable(force)
-    contents, notes = _contents(calibrated, targets, force)
+    contents, notes = _new_contents(calibrated, targets, force)
     existing = [path for path in contents if own_stream(path) is None and path.exists()]
     new = {path: content for path, content in contents.items() if path not in existing or path.read_bytes() != content}
     unchanged = tuple(path for path in contents if path not in new)
@@ -488,7 +489,7 @@ def _difference(path: Path, before: bytes, after: bytes) -> str:
     return "".join(f"{printable(line)}\n" for line in lines)
 
 
-def _contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:
+def _new_contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:
     """Return new contents by file, and notes."""
     contents: dict[Path, bytes] = {}
     notes = []

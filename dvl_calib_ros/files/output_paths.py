@@ -112,6 +112,7 @@ def _parents(path: str) -> Iterator[str]:
 
 
 def _identity(path: str) -> _Identity | None:
+    """Return device and inode of a path; None if it does not exist."""
     with suppress(OSError, ValueError):
         found = os.stat(path)
         return found.st_dev, found.st_ino

@@ -95,6 +95,7 @@ def _in_radians(value: Any) -> Any:
 
 
 def _number_or_degrees(value: Any) -> Any:
+    """Return a text such as ``90 deg`` as radians, or as a number; other values unchanged."""
     if not isinstance(value, str):
         return value
     found = _DEGREES.match(value.strip())
@@ -105,6 +106,7 @@ def _number_or_degrees(value: Any) -> Any:
 
 
 def _node_parameters(path: Path, text: str | None = None) -> dict[str, Any]:
+    """Return this node's parameters in a ROS parameter file, without use_sim_time and the like."""
     sections = _own_sections(path, NODE_NAME, section_is_ours, text)
     values: dict[str, Any] = {}
     for _, body in sections:
@@ -145,7 +147,7 @@ def _own_sections(
     if not own_sections:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
         raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
-    return [(name, _flat(body)) for name, body in own_sections]
+    return [(name, _flattened(body)) for name, body in own_sections]
 
 
 def _names_for_all_nodes(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> set[str]:
@@ -196,11 +198,12 @@ def section_is_ours(node: str) -> bool:
     return fnmatch.fnmatchcase(NODE_NAME, node.rsplit("/", 1)[-1])
 
 
-def _flat(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+def _flattened(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Join nested mappings into one, with names separated by dots."""
     values: dict[str, Any] = {}
     for key, value in body.items():
         name = f"{prefix}{key}"
-        values |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        values |= _flattened(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return values
 
 
@@ -234,7 +237,7 @@ def parameter_table() -> str:
     for name, spec in SCHEMA.items():
         about = " ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
         at_run_time = "" if spec.read_only else " *"
-        lines.append(f"| `{name}`{at_run_time} | {_shown(spec.default)} | {about} | {spec.description} |")
+        lines.append(f"| `{name}`{at_run_time} | {_default_text(spec.default)} | {about} | {spec.description} |")
     return "\n".join(lines) + "\n"
 
 
@@ -246,7 +249,8 @@ def model_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _shown(default: Any) -> str:
+def _default_text(default: Any) -> str:
+    """Return a default value as text for the table of parameters."""
     if isinstance(default, tuple):
         return " ".join(f"{value:g}" for value in default)
     if isinstance(default, bool):

@@ -102,7 +102,7 @@ def result_document(
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,
-        "found": _Lines(_found(result)),
+        "found": _Lines(_found_quantities(result)),
         "mounting": {
             "static_transform_publisher": None if arguments is None else f"{_PUBLISHER} {arguments}",
             "urdf_origin": origin_tag(position, rpy_from_rotation(of_frame)),
@@ -158,7 +158,7 @@ def days_document(result: Result) -> dict[str, Any]:
     }
 
 
-def _found(result: Result) -> dict[str, str]:
+def _found_quantities(result: Result) -> dict[str, str]:
     """Return each quantity with its σ, and which configured values the model does not estimate."""
     found = {each.name: _in_words(each) for each in quantities(result)}
     configured = {"lever arm": result.parameters["lever_arm"], LATE: [result.parameters["dvl_time_offset"]]}
@@ -174,6 +174,7 @@ def _in_words(found: Quantity) -> str:
 
 
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
+    """Return 1 σ of each state with its unit, by the state's name."""
     units = {"phi": (math.degrees(1.0), "deg"), "delta": (100.0, "%")}
     known = {each.name: (1.0, each.unit) for each in MODELS[estimate.model].nuisance}
     words = {}
@@ -287,14 +288,14 @@ def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     if ranks[0] > ranks[1]:
         return before
-    return before if not continued and not moved and _spread(p_new) > _spread(p_old) else None
+    return before if not continued and not moved and _angle_spread(p_new) > _angle_spread(p_old) else None
 
 
 def _covariance_of_angles(mounting: Mapping[str, Any]) -> Array:
     return np.array(mounting["pose_covariance"], dtype=float)[3:, 3:]
 
 
-def _spread(covariance: Array) -> tuple[int, float]:
+def _angle_spread(covariance: Array) -> tuple[int, float]:
     """Return the number of angles that are not estimated, and the sum of variances (rad²) of the others."""
     variances = np.diag(covariance)
     return int((variances <= 0.0).sum()), float(variances[variances > 0.0].sum())
@@ -314,7 +315,7 @@ def _quality(document: Mapping[str, Any]) -> str:
 
 
 def _quality_in_words(document: Mapping[str, Any]) -> str:
-    sigma = math.degrees(math.sqrt(_spread(_covariance_of_angles(document["mounting"]))[1]))
+    sigma = math.degrees(math.sqrt(_angle_spread(_covariance_of_angles(document["mounting"]))[1]))
     return f"{_quality(document)}, ±{sigma:.2f}° of {document['used']} samples"
 
 
@@ -422,6 +423,7 @@ def _check_says_one_thing(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequence[float] | None) -> None:
+    """Raise InputError if a saved result is relative to another nominal mounting (rad)."""
     if mounting_rpy is None:
         return
     try:

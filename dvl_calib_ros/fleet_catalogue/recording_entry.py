@@ -65,7 +65,7 @@ class StoredRecording:
 
     @property
     def is_remote(self) -> bool:
-        """Whether it must be copied for reading."""
+        """Return whether the recording must be copied before it can be read."""
         return "://" in self.where
 
     def vehicle(self, pattern: re.Pattern[str] | None) -> str:
@@ -79,7 +79,7 @@ class StoredRecording:
         return as_text(folders[0] if len(folders) > 1 else PurePosixPath(self.place).name or self.place)
 
     @contextmanager
-    def at_hand(self) -> Iterator[Path]:
+    def local_copy(self) -> Iterator[Path]:
         """Yield a local path of the recording."""
         if not self.is_remote:
             if not os.path.exists(self.where):  # missing on another worker's machine; the recording itself has no fault
@@ -87,7 +87,7 @@ class StoredRecording:
             yield Path(self.where)
             return
         with tempfile.TemporaryDirectory(prefix="dvl_calib_fleet_") as folder:
-            store = _store(self.where)[0]
+            store = _open_store(self.where)[0]
             target = Path(folder) / PurePosixPath(self.where).name
             is_folder = [each.where for each in self.files] != [self.where]
             if is_folder:
@@ -122,8 +122,8 @@ def recordings_in(places: Sequence[str]) -> tuple[list[StoredRecording], list[st
     found: dict[str, StoredRecording] = {}
     unread: list[str] = []
     for place in places:
-        files = _local_files(place, unread) if "://" not in place or place.startswith("file://") else _stored(place)
-        for each in _grouped(*files):
+        files = _local_files(place, unread) if "://" not in place or place.startswith("file://") else _in_store(place)
+        for each in _group_into_recordings(*files):
             found.setdefault(each.where, each)
     if not found:
         raise InputError(f"{', '.join(places)}: no recording (.mcap, .db3, .bag) there or below; name another place")
@@ -170,15 +170,16 @@ def _local_files(place: str, unread: list[str]) -> _Files:
 
 
 def _local_file(path: str) -> StoredFile:
+    """Return a local file with size and time of change. Raises OSError if it is no regular file."""
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "is no file")  # a pipe would block
     return StoredFile(path, status.st_size, str(status.st_mtime_ns))
 
 
-def _stored(place: str) -> _Files:
-    """Return root and files by folder of an object store. Raises InputError."""
-    store, root = _store(place)
+def _in_store(place: str) -> _Files:
+    """Return the root of a place in an object store, and its recordings' files by folder. Raises InputError."""
+    store, root = _open_store(place)
     try:
         found: Mapping[str, Mapping[str, Any]] = store.find(root, detail=True)
     except Exception as error:  # each store has its own errors
@@ -197,7 +198,7 @@ def _stored(place: str) -> _Files:
     return place.rpartition("/")[0] if is_file else place.rstrip("/"), files
 
 
-def _store(place: str) -> tuple[Any, str]:
+def _open_store(place: str) -> tuple[Any, str]:
     """Return the store of a URL, and the path in it. Raises InputError."""
     try:
         from fsspec.core import url_to_fs
@@ -210,7 +211,7 @@ def _store(place: str) -> tuple[Any, str]:
     return store, root
 
 
-def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterator[StoredRecording]:
+def _group_into_recordings(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterator[StoredRecording]:
     """Yield bags and single files: a folder is one bag if its files are numbered as rosbag2 does."""
     bags: list[str] = []
     for folder, files in sorted(folders.items()):
@@ -231,6 +232,7 @@ def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterato
 
 
 def _is_bag(folder: str, files: Sequence[StoredFile], storage: Sequence[StoredFile]) -> bool:
+    """Return whether a folder has rosbag2's metadata, or only files numbered as rosbag2 does."""
     if any(each.where.endswith(f"/{METADATA}") for each in files):
         return True
     numbered = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
@@ -279,9 +281,9 @@ def entry_of(task: Task) -> Entry:
     """Calibrate with a recording. Any exception becomes the entry's error."""
     where = task.recording.name
     try:
-        with task.recording.at_hand() as path:
+        with task.recording.local_copy() as path:
             try:
-                return _calibrated(task, path)
+                return _calibrate(task, path)
             except InputError as error:
                 return failed(where, as_text(str(error).replace(str(path), task.recording.where)))
     except Exception as error:
@@ -293,7 +295,8 @@ def failed(where: str, why: str, is_final: bool = True) -> Entry:
     return Entry([{"recording": where, "error": why}], None, is_final)
 
 
-def _calibrated(task: Task, path: Any) -> Entry:
+def _calibrate(task: Task, path: Any) -> Entry:
+    """Discover topics and frames of a recording and replay it."""
     recording = open_recording([path], None, task.parameters)
     found = discover(recording, task.parameters, task.given)
     replayed = checked_replay(
@@ -328,13 +331,14 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
     extrinsics, without_day = (extrinsics_of_replay(each, where) for each in (replayed, _without_day(replayed)))
     extrinsics_row = None
     if extrinsics is not None and without_day is not None:
-        extrinsics_row = {**_plain(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
+        extrinsics_row = {**_plain_data(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
         extrinsics_row |= _cause(replayed)
     rows = (*_quantities(result), *_heading(estimate), *_water(replayed.water))
     return Entry([common | each for each in rows], extrinsics_row)
 
 
 def _day(stamp_ns: int) -> date | None:
+    """Return the UTC date of a stamp; None for an invalid one."""
     try:
         return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).date()
     except (ValueError, OverflowError, OSError):  # an invalid time
@@ -344,12 +348,12 @@ def _day(stamp_ns: int) -> date | None:
 def _quantities(result: Result) -> list[Row]:
     """Return rows of mounting, scale and delay, with σ of the filter, of this recording, and of the next."""
     estimate = result.estimate
-    claims = (estimate.filter_covariance, estimate.recording_covariance, estimate.covariance)
+    covariances = (estimate.filter_covariance, estimate.recording_covariance, estimate.covariance)
     by_claim = [
         quantities(
             replace(result, estimates={**result.estimates, result.selected: replace(estimate, covariance=claim)})
         )
-        for claim in claims
+        for claim in covariances
     ]
     return [
         {
@@ -408,7 +412,7 @@ def _without_day(replayed: Replayed) -> Replayed:
     return replace(replayed, result=replace(replayed.result, parameters=parameters))
 
 
-def _plain(extrinsics: Extrinsics) -> dict[str, Any]:
+def _plain_data(extrinsics: Extrinsics) -> dict[str, Any]:
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(extrinsics).items()
     }

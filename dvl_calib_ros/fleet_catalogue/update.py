@@ -122,7 +122,7 @@ class Catalogue:
         """
         for path in sorted(self.rows.glob("*.parquet")):
             try:
-                part = self._part(path)
+                part = self._read_part(path)
             except InputError as error:
                 self._set_aside(path, str(error))
                 continue
@@ -133,15 +133,15 @@ class Catalogue:
         """Return the rows of a recording. Raises InputError if its part is damaged."""
         from pyarrow import parquet
 
-        content = self._whole(self._path(recording))
+        content = self._read_checked(self._path(recording))
         found: list[Row] = parquet.read_table(self._arrow.BufferReader(content)).to_pylist()
         return found
 
-    def _part(self, path: Path) -> CataloguePart:
+    def _read_part(self, path: Path) -> CataloguePart:
         """Read a file's own description. Raises InputError if it is no part, damaged, or misnamed."""
         from pyarrow import parquet
 
-        content = self._whole(path)
+        content = self._read_checked(path)
         try:
             metadata = json.loads(parquet.read_schema(self._arrow.BufferReader(content)).metadata[_KEY])
             part = CataloguePart(**metadata)
@@ -151,7 +151,7 @@ class Catalogue:
             raise InputError(f"{path}: holds {part.recording}, which belongs in a file of another name")
         return part
 
-    def _whole(self, path: Path) -> bytes:
+    def _read_checked(self, path: Path) -> bytes:
         """Read a file. Raises InputError if any bit has changed."""
         content = read_file(path, "part of a catalogue")
         if _CHECKSUM not in content or _with_checksum(content) != content:
@@ -159,6 +159,7 @@ class Catalogue:
         return content
 
     def _set_aside(self, path: Path, why: str) -> None:
+        """Move a faulty file to the folder `ASIDE`, and note why."""
         aside = self.folder / ASIDE
         place = aside / path.name
         try:
@@ -177,6 +178,7 @@ class Catalogue:
         return self.rows / f"{name}-{hashlib.sha256(recording.encode()).hexdigest()[:16]}.parquet"
 
     def _save(self, part: CataloguePart, rows: list[Row]) -> None:
+        """Write the rows of a recording as a Parquet file with its checksum."""
         from pyarrow import parquet
 
         rows = [{name: as_cell(value) for name, value in row.items()} for row in rows]
@@ -203,6 +205,7 @@ def _stamped(row: Row) -> Row:
 
 
 def _arrow() -> Any:
+    """Return pyarrow. Raises InputError if it is not installed."""
     try:
         import pyarrow
     except ImportError as error:
@@ -298,10 +301,11 @@ def run_fleet(
         fingerprint = _fingerprint(each, options) if entry.is_final else ""
         catalogue.write(CataloguePart(each.name, each.vehicle(pattern), fingerprint, entry.extrinsics), entry)
         on_progress(number / len(tasks))
-    return _read(catalogue, len(to_do), len(recordings) - len(to_do), notes)
+    return _read_catalogue(catalogue, len(to_do), len(recordings) - len(to_do), notes)
 
 
-def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence[str]) -> Fleet:
+def _read_catalogue(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence[str]) -> Fleet:
+    """Read the catalogue and compute the history of each vehicle."""
     entries = [
         Catalogued.of(part.recording, part.vehicle, catalogue.rows_of(part.recording), part.extrinsics)
         for part in sorted(catalogue.parts(), key=lambda part: part.recording)
@@ -318,9 +322,9 @@ def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence
     )
 
 
-def _check_reach(left: Sequence[StoredRecording], workers: Workers) -> None:
+def _check_reach(remaining: Sequence[StoredRecording], workers: Workers) -> None:
     """Raise InputError for files that other processes cannot read."""
-    for each in left:
+    for each in remaining:
         if each.where.startswith("memory://") and (workers.dask or workers.jobs != 1):
             raise InputError(f"{each.where}: is in the memory of this process alone; read it with --jobs 1")
 

@@ -39,15 +39,15 @@ class Catalogued:
     cause_of_scale: str = ""
 
     @staticmethod
-    def of(recording: str, vehicle: str, rows: Sequence[Row], told: Mapping[str, Any] | None) -> Catalogued:
+    def of(recording: str, vehicle: str, rows: Sequence[Row], document: Mapping[str, Any] | None) -> Catalogued:
         """Build from the plain data of a part."""
-        if told is None:
+        if document is None:
             return Catalogued(recording, vehicle, tuple(rows))
-        values = {field.name: told[field.name] for field in fields(Extrinsics) if field.name in told}
+        values = {field.name: document[field.name] for field in fields(Extrinsics) if field.name in document}
         for name in values.keys() & {"value", "covariance", "by_bias"}:
             values[name] = np.array(values[name])
         values["shown"] = np.array(values["shown"], dtype=bool)
-        covariance, cause = np.array(told["covariance_of_recording"]), str(told.get("cause_of_scale", ""))
+        covariance, cause = np.array(document["covariance_of_recording"]), str(document.get("cause_of_scale", ""))
         return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**values), covariance, cause)
 
     @property
@@ -57,7 +57,7 @@ class Catalogued:
 
     @property
     def is_usable(self) -> bool:
-        """Whether its values and σ are valid."""
+        """Return whether the estimated values and σ are valid."""
         return self.extrinsics is not None and not self.extrinsics.rejected
 
 
@@ -163,27 +163,30 @@ def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
 
 
 def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
+    """Return the history of a vehicle: days, comparison, heading deviation and water."""
     usable = [each for each in entries if each.is_usable]
     # models without GNSS assume no current, so they are not compared with models with GNSS
     aided = [each for each in entries if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
-    days = _days([each for each in aided if each.is_usable] or usable)
+    days = _average_days([each for each in aided if each.is_usable] or usable)
     rejected = [
         replace(each.extrinsics, name=each.recording.rpartition("/")[2])
         for each in aided
         if each.extrinsics is not None and not each.is_usable
     ]
-    compared = _compared([*days, *rejected]) if days else None
+    compared = _compare_if_several([*days, *rejected]) if days else None
     return VehicleHistory(name, len(entries), tuple(days), compared, _heading(usable), _water(usable))
 
 
-def _compared(several: Sequence[Extrinsics]) -> Comparison | None:
+def _compare_if_several(several: Sequence[Extrinsics]) -> Comparison | None:
+    """Compare calibrations; None for fewer than two, or without a common observable quantity."""
     try:
         return compare(several) if len(several) > 1 else None
     except InputError:  # no quantity is observable in two of them
         return None
 
 
-def _days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
+def _average_days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
+    """Average the recordings of each day, separately before and after a movement of the mounting."""
     by_day: dict[int, list[tuple[Extrinsics, Array]]] = defaultdict(list)
     for each in entries:
         if each.extrinsics is not None and each.covariance_of_recording is not None:
@@ -191,13 +194,13 @@ def _days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
     found = []
     for _, of_one_day in sorted(by_day.items()):
         of_one_day.sort(key=lambda each: each[0].first_ns)
-        found += [_of_day(part) for part in _split_at_moves(of_one_day)]
+        found += [_average_day(part) for part in _split_at_moves(of_one_day)]
     return found
 
 
 def _split_at_moves(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
     """Split the recordings of one day where the mounting moved."""
-    compared = _compared([each for each, _ in own])
+    compared = _compare_if_several([each for each, _ in own])
     starts = [] if compared is None else [change.first_after.name for change in compared.moved]
     parts: list[list[tuple[Extrinsics, Array]]] = [[]]
     for each in own:
@@ -207,7 +210,7 @@ def _split_at_moves(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extr
     return parts
 
 
-def _of_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
+def _average_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
     """Average a day's recordings, adding the variation between days once."""
     of_days = [each.covariance - alone for each, alone in own]
     together = fused([replace(each, covariance=alone) for each, alone in own])

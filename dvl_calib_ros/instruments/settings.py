@@ -126,22 +126,23 @@ def instrument_settings(
 
 
 def _recorded_sound(
-    calibrated: CalibratedMounting, instrument: Instrument, told: Mapping[str, float]
+    calibrated: CalibratedMounting, instrument: Instrument, now: Mapping[str, float]
 ) -> dict[str, float]:
     """Return the speed of sound used in the recording. Raises InputError if another was given."""
     used = math.nan if calibrated.water is None else calibrated.water.used
     holds = instrument.ranges.get(SPEED_OF_SOUND)
     if holds is None or not holds.least <= used <= holds.most:
         return {}
-    if abs(told.get(SPEED_OF_SOUND, used) - used) > SAME_SPEED:
+    if abs(now.get(SPEED_OF_SOUND, used) - used) > SAME_SPEED:
         raise InputError(
-            f"{SPEED_OF_SOUND}={told[SPEED_OF_SOUND]:g}: the recording says that the DVL used {used:.1f} m/s; leave it "
+            f"{SPEED_OF_SOUND}={now[SPEED_OF_SOUND]:g}: the recording says that the DVL used {used:.1f} m/s; leave it "
             "out, or calibrate with a recording of that setting"
         )
     return {SPEED_OF_SOUND: round(used, 2)}
 
 
 def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    """Return settings, command to send and notes for a Water Linked DVL."""
     offset, swing = _heading(calibrated, now["mounting_rotation_offset"])
     angle = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
     sound, of_sound = _speed_of_sound(calibrated, now.get(SPEED_OF_SOUND))
@@ -177,6 +178,7 @@ def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[
 
 
 def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    """Return settings, commands and notes for a Cerulean DVL."""
     heading, swing = _heading(calibrated, now["heading"])
     settings = [Setting("heading", now["heading"], round(math.remainder(heading, 360.0), 2), "°")]
     lines = [f"SET-SENSOR-ORIENTATION {now['roll']:g}, {now['pitch']:g}, {settings[0].new:g}"]
@@ -203,16 +205,16 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
     rotation = calibrated.rotation_body_from_dvl
     clockwise = -math.atan2(rotation[1, 0], rotation[0, 0])
     quarters = round(clockwise / QUARTER)
-    off = math.remainder(clockwise - quarters * QUARTER, 2.0 * math.pi)
-    if abs(off) > NEAR_QUARTER:
+    error = math.remainder(clockwise - quarters * QUARTER, 2.0 * math.pi)
+    if abs(error) > NEAR_QUARTER:
         raise InputError(
             f"ardupilot: the DVL is rotated by {math.degrees(clockwise):+.1f}° (clockwise), and VISO_ORIENT has only "
             "quarter turns; set the rest in the DVL itself (--instrument waterlinked or cerulean)"
         )
     settings.append(Setting("VISO_ORIENT", now.get("VISO_ORIENT"), float(quarters % 4 * 2)))
-    if abs(off) > REPORTED_FROM_RAD:
+    if abs(error) > REPORTED_FROM_RAD:
         notes.append(
-            f"{math.degrees(off):+.2f}° of yaw (clockwise) remain: VISO_ORIENT has only quarter turns. Set them in "
+            f"{math.degrees(error):+.2f}° of yaw (clockwise) remain: VISO_ORIENT has only quarter turns. Set them in "
             "the DVL itself (--instrument waterlinked or cerulean)"
         )
     delay = round(1000.0 * calibrated.dvl_time_offset)
@@ -238,10 +240,10 @@ def _heading(calibrated: CalibratedMounting, now_deg: float) -> tuple[float, Arr
     found = configured @ calibrated.rotation_body_from_dvl
     if not _is_down(calibrated):
         found = FLU_FROM_FRD @ found @ FLU_FROM_FRD
-    whole = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
-    *_, z, w = quaternion_from_rotation(whole)
+    rotation = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
+    *_, z, w = quaternion_from_rotation(rotation)
     angle = 2.0 * math.atan2(z, w)  # the rotation about the DVL's z axis; the rest is about a horizontal one
-    return math.degrees(angle), whole @ rotation_from_rpy(np.array([0.0, 0.0, -angle]))
+    return math.degrees(angle), rotation @ rotation_from_rpy(np.array([0.0, 0.0, -angle]))
 
 
 def _is_down(calibrated: CalibratedMounting) -> bool:
@@ -250,6 +252,7 @@ def _is_down(calibrated: CalibratedMounting) -> bool:
 
 
 def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
+    """Return notes on roll and pitch, which the instrument cannot correct; swing: (3, 3) left after its heading."""
     roll_pitch = np.abs(rpy_from_rotation(swing)[:2])
     notes = ["URDF and parameters stay unchanged: do not write this result into them as well"]
     if roll_pitch.max() <= REPORTED_FROM_RAD:
@@ -266,10 +269,11 @@ def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
 
 
 def _delay(calibrated: CalibratedMounting) -> list[str]:
-    late = calibrated.dvl_time_offset
+    """Return a note on a DVL delay, for which the instrument has no setting."""
+    delay_s = calibrated.dvl_time_offset
     return (
-        [f"the DVL's stamps are {late:+.3f} s late against the IMU's, for which the instrument has no setting"]
-        if late
+        [f"the DVL's stamps are {delay_s:+.3f} s late against the IMU's, for which the instrument has no setting"]
+        if delay_s
         else []
     )
 
@@ -328,12 +332,12 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
         with socket.create_connection((parts["ipv6"] or parts["host"], port), timeout=PATIENCE_S) as connection:
             dvl = _Dvl(connection, address)
             before = dvl.ask({"command": "get_config"})
-            if all(_is(before, each.name, each.new) for each in settings):
+            if all(_is_set_to(before, each.name, each.new) for each in settings):
                 return True
             for each in settings:
-                if each.now is None or not _is(before, each.name, each.now):
+                if each.now is None or not _is_set_to(before, each.name, each.now):
                     raise InputError(
-                        f"{address}: {each.name} is {_held(before, each.name)}, and was {each.now} when the "
+                        f"{address}: {each.name} is {_number(before, each.name)}, and was {each.now} when the "
                         "data were recorded (--now), which the calibration is relative to; record again, or set "
                         "it yourself"
                     )
@@ -353,22 +357,22 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
             ) from error
         raise InputError(f"{address}: {why}; is the DVL on, and the address right?") from error
     for each in settings:
-        if not _is(after, each.name, each.new):
+        if not _is_set_to(after, each.name, each.new):
             raise InputError(
-                f"{address}: {each.name} was set to {each.new:g} and is {_held(after, each.name)}; look at the DVL's "
+                f"{address}: {each.name} was set to {each.new:g} and is {_number(after, each.name)}; look at the DVL's "
                 "own page"
             )
     return False
 
 
-def _held(config: Any, name: str) -> float | str:
+def _number(config: Any, name: str) -> float | str:
     """Return the number that a DVL has under a name."""
     held = config.get(name) if isinstance(config, dict) else None
     return held if isinstance(held, float) else "no number"
 
 
-def _is(config: Any, name: str, value: float) -> bool:
-    held = _held(config, name)
+def _is_set_to(config: Any, name: str, value: float) -> bool:
+    held = _number(config, name)
     return isinstance(held, float) and abs(held - value) <= AS_SET
 
 
@@ -383,7 +387,7 @@ class _Dvl:
         self._connection.sendall(json.dumps(command).encode() + b"\n")
         until = time.monotonic() + PATIENCE_S
         while True:
-            line = self._line(until)
+            line = self._read_line(until)
             try:
                 answer = json.loads(line, parse_int=float)  # as float, because an integer may be too long to parse
             except (ValueError, RecursionError):
@@ -396,7 +400,8 @@ class _Dvl:
                 raise InputError(f"{self._address}: refuses {command['command']} ({why})")
             return answer.get("result")
 
-    def _line(self, until: float) -> bytes:
+    def _read_line(self, until: float) -> bytes:
+        """Return the next line from the instrument. Raises TimeoutError at the monotonic time `until`."""
         while b"\n" not in self._pending:
             remaining = until - time.monotonic()
             if remaining <= 0.0 or len(self._pending) > LONGEST_LINE:

@@ -118,6 +118,7 @@ class _VehicleMessages:
         _TAKERS[message.get_type()](self, stamp_ns, message)
 
     def _delta(self, stamp_ns: int, metres: Array, seconds: float, is_good: bool) -> None:
+        """Add the mean velocity over a displacement (m) in a time (s), stamped at its middle."""
         if not (is_good and seconds > 0.0 and np.isfinite(metres).all()):
             self.left_out["without bottom lock"] += 1
             return
@@ -136,12 +137,14 @@ class _VehicleMessages:
             self._fix(stamp_ns, m.Status, m.Spd, m.GCrs, m.VZ)
 
     def gps_raw_int(self, stamp_ns: int, m: Any) -> None:
+        """Add a velocity of MAVLink's GPS_RAW_INT, unless it is marked as unknown."""
         if m.vel == 65535 or m.cog == 65535:
             self.left_out["without a velocity of GNSS"] += 1
             return
         self._fix(stamp_ns, m.fix_type, 0.01 * m.vel, 0.01 * m.cog, 0.0)  # no vertical velocity, marked by exactly 0
 
     def _fix(self, stamp_ns: int, status: int, speed: float, course_deg: float, down: float) -> None:
+        """Add a GNSS velocity, north-east-down, from speed (m/s), course (°) and velocity down (m/s)."""
         if status < _FIX or not math.isfinite(speed + course_deg + down):
             self.left_out["without a fix"] += 1
             return

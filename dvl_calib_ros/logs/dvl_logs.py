@@ -71,11 +71,11 @@ def read_dvl_log(path: Path) -> DvlLog:
         log = read_ardupilot_log(path, start)
     else:
         content = path.read_bytes()
-        held = [kind for kind, (holds, _) in _KINDS.items() if holds(content)]
-        log = (_KINDS[held[0]][1] if held else _read_pd0)(path, content)
-        if len(held) > 1:
-            others = " and ".join(held[1:])
-            note = f"{path}: holds {others} as well as {held[0]}, which alone are imported; split it for the rest"
+        kinds = [kind for kind, (holds, _) in _KINDS.items() if holds(content)]
+        log = (_KINDS[kinds[0]][1] if kinds else _read_pd0)(path, content)
+        if len(kinds) > 1:
+            others = " and ".join(kinds[1:])
+            note = f"{path}: holds {others} as well as {kinds[0]}, which alone are imported; split it for the rest"
             log = log._replace(notes=(*log.notes, note))
     if not log.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"
@@ -279,6 +279,7 @@ def _pd0_water(stamp_ns: int, data: dict[int, bytes]) -> WaterReading | None:
 
 
 def _pd0_stamp(data: dict[int, bytes]) -> int:
+    """Return the stamp (ns) of an ensemble's clock, taken as UTC."""
     year, month, day, hour, minute, second, hundredths = data[_VARIABLE_LEADER][4:11]
     # RDI's year has two digits; no DVL before 2000 has this format
     at = datetime(2000 + year, month, day, hour, minute, second, tzinfo=timezone.utc)
@@ -306,7 +307,7 @@ def _pd0_sample(path: Path, stamp_ns: int, data: dict[int, bytes], left_out: Cou
             left_out["in earth axes without a heading"] += 1
             return None
         roll, pitch, heading = attitude
-        turned = _turned_by(roll, pitch, heading + _pd0_alignment(data), data[_FIXED_LEADER])
+        turned = _applied_rotation(roll, pitch, heading + _pd0_alignment(data), data[_FIXED_LEADER])
         instrument = turned.T @ measured[:3]
     x, y, z = (-0.001 * _FLU_FROM_RDI @ instrument + 0.0).tolist()
     return DvlSample(stamp_ns, (x, y, z), None)
@@ -320,10 +321,11 @@ def _instrument_from_beams(fixed: bytes) -> Array:
     return np.array([[a, -a, 0.0, 0.0], [0.0, 0.0, -a, a], [b, b, b, b]])
 
 
-def _turned_by(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
-    """Return the rotation (3, 3) that the instrument applied: by beam 3's heading and, if set, by its tilts.
+def _applied_rotation(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
+    """Return the rotation (3, 3) that the instrument applied: heading of beam 3 and, if configured, tilts.
 
-    (Same document, eq. 18.) Its transpose undoes it, whatever the accuracy of the heading.
+    fixed: fixed leader. (Same document, eq. 18.) The transpose undoes the rotation exactly, even if the heading is
+    inaccurate.
     """
     if not fixed[25] & 4:
         roll = pitch = 0.0

@@ -91,13 +91,13 @@ def _sample(data: bytes) -> DvlSample | None:
     """Return a record's velocity, with the mean of its valid vertical velocities; None without bottom lock."""
     _, _, _, year, month, day, hour, minute, second, fraction, _, _, status, *_ = _LEADER.unpack_from(data)
     values = np.array(_BY_AXIS.unpack_from(data, _LEADER.size + _BY_BEAM.size), dtype=float).reshape(3, 4)
-    velocity, noise, late = values
+    velocity, noise, delay = values
     valid = np.array([bool(status & bit) for bit in _VALID]) & np.isfinite(velocity) & (velocity > _BAD_VELOCITY)
     if not (valid[0] and valid[1] and valid[2:].any()):
         return None
     # as in C's struct tm: years since 1900, months from 0
     at = datetime(1900 + year, month + 1, day, hour, minute, second, tzinfo=timezone.utc)
-    dt = float(late[:2].mean())
+    dt = float(delay[:2].mean())
     stamp_ns = int(at.timestamp()) * 1_000_000_000 + fraction * 100_000
     stamp_ns += round(1e9 * dt) if 0.0 <= dt < _LONGEST_DT_S else 0
     weights = valid[2:] / valid[2:].sum()

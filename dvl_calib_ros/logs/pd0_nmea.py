@@ -133,6 +133,7 @@ class Nmea:
         return stamps, values[:, 0]
 
     def _in_order(self, kind: str) -> tuple[list[int], Array]:
+        """Return stamps (ns) and values of one kind of sentence, with the sign of DT that spaces them most evenly."""
         own = self._found[kind]
         if not own:
             return [], np.zeros((0, 2))
@@ -153,7 +154,7 @@ def _values(kind: str, specific: int, body: bytes) -> list[float]:
     text = body.rstrip(b"\0\r\n ")
     sentence = _SENTENCE.match(text) if text.isascii() and b"\0" not in text else None
     if sentence is not None:
-        return _of_text(kind, sentence)
+        return _parse_text_sentence(kind, sentence)
     header = 10 if 100 <= specific < 104 else 7
     fields = _BINARY[kind].unpack_from(body, header)
     if kind == _VTG:
@@ -165,7 +166,8 @@ def _values(kind: str, specific: int, body: bytes) -> list[float]:
     return _position(latitude, south, longitude, west, quality)
 
 
-def _of_text(kind: str, sentence: re.Match[bytes]) -> list[float]:
+def _parse_text_sentence(kind: str, sentence: re.Match[bytes]) -> list[float]:
+    """Parse the values of a sentence in text, see `_values`. Raises ValueError for another kind or a wrong checksum."""
     name, text, checksum = sentence.groups()
     fields = text.decode("ascii").split(",")
     whole = sentence[0][1:].partition(b"*")[0]

@@ -62,8 +62,8 @@ def numbers_of(path: Path, rows: Sequence[Sequence[str]], at: Sequence[int], n_c
         try:
             values.append([math.nan if row[i].strip().lower() in NO_VALUE else _number(row[i]) for i in at])
         except ValueError:
-            shown = ",".join(row)[:SHOWN]
-            raise InputError(f"{path}: data row {number} is not all numbers: {shown}; expected {EXPECTED}") from None
+            excerpt = ",".join(row)[:SHOWN]
+            raise InputError(f"{path}: data row {number} is not all numbers: {excerpt}; expected {EXPECTED}") from None
     return np.array(values, dtype=float).reshape(-1, len(at))
 
 
@@ -133,6 +133,7 @@ def read_columns(path: Path, unit: str) -> TimedRows:
 
 
 def _read_npy(path: Path) -> Array:
+    """Read an array from a NumPy file. Raises InputError."""
     try:
         return np.asarray(np.load(path, allow_pickle=False), dtype=float)
     except Exception as error:  # damaged files raise many types, MemoryError among them
@@ -152,7 +153,7 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
     if len(header) != N_COLUMNS:
         names = ", ".join(cell.strip() for cell in header)[:SHOWN]
         raise InputError(
-            f"{path}: has {len(header)} columns, expected {EXPECTED}; of a DVL's table name them with --columns "
+            f"{path}: has {len(header)} columns, expected {EXPECTED}; of a DVL's table name all four with --columns "
             f"time=NAME,vx=NAME,vy=NAME,vz=NAME; there are {names}"
         )
     units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
@@ -303,6 +304,7 @@ def import_recording(
 
 
 def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[ReferenceSample]:
+    """Read the reference velocities of a file by its kind; none from positions."""
     from .pd0_nmea import is_nmea, read_rmc
 
     if is_nmea(path):
@@ -359,6 +361,8 @@ def column_map(text: str) -> Mapping[str, str]:
     unknown = [key for key in found if key not in _KEYS]
     if missing or unknown:
         what = f"{unknown[0]!r} is none of {', '.join(_KEYS)}" if unknown else f"{missing[0]} is missing"
+        if missing == ["vz"] and not unknown:
+            what += ", and two velocities show no mounting: import the DVL's own log, or log the vertical one as well"
         raise InputError(f"--columns: {what}; write time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME")
     return found
 
@@ -377,7 +381,7 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
         raise InputError(f"{path}: cannot be read as text ({error}); save it in UTF-8") from error
     first = next((line for line in lines if line.strip()), "")
     rows = [row for row in csv.reader(lines, delimiter=max(_SEPARATORS, key=first.count)) if row]
-    at = {key: [_place(path, rows[:1], name) for name in names[key].split("+")] for key in names}
+    at = {key: [_column_index(path, rows[:1], name) for name in names[key].split("+")] for key in names}
     covariance = np.eye(3) * std**2 if std else None
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
@@ -396,8 +400,8 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
             x, y, z = velocity.tolist()
             samples.append(DvlSample(stamp_ns, (x, y, z), covariance))
     if not samples:
-        shown = repr(",".join(rows[-1])[:SHOWN]) if rows else "it is empty"
-        raise InputError(f"{path}: no row with time and velocity in the columns of --columns; the last is {shown}")
+        excerpt = repr(",".join(rows[-1])[:SHOWN]) if rows else "it is empty"
+        raise InputError(f"{path}: no row with time and velocity in the columns of --columns; the last is {excerpt}")
     return DvlLog(sorted({each.stamp_ns: each for each in samples}.values(), key=lambda each: each.stamp_ns), left_out)
 
 
@@ -409,15 +413,15 @@ def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
         return True
 
 
-def _place(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
+def _column_index(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
     """Return the index of a column by its name, its name without the unit, or its number. Raises InputError."""
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
-    wanted = name.strip().lower()
+    key = name.strip().lower()
     for each in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
-        if wanted in each:
-            return each.index(wanted)
-    if wanted.isdecimal() and 0 < int(wanted) <= len(header):
-        return int(wanted) - 1
+        if key in each:
+            return each.index(key)
+    if key.isdecimal() and 0 < int(key) <= len(header):
+        return int(key) - 1
     raise InputError(f"{path}: --columns: no column {name!r}; there are {', '.join(header)[:SHOWN] or 'none'}")
 
 
@@ -426,13 +430,14 @@ def _stamp_ns(text: str, start_ns: int) -> int:
     try:
         seconds = float(text)
     except ValueError:
-        at = _moment(text)
+        at = _parse_time(text)
         at = at if at.tzinfo is not None else at.replace(tzinfo=timezone.utc)
         return int(at.replace(microsecond=0).timestamp()) * 1_000_000_000 + at.microsecond * 1000
     return round(seconds * 1e9) + (0 if seconds >= _SINCE_1970_S else start_ns)
 
 
-def _moment(text: str) -> datetime:
+def _parse_time(text: str) -> datetime:
+    """Parse a date and time in one of the common formats. Raises ValueError."""
     for form in _FORMATS:
         try:
             return datetime.strptime(text, form)

@@ -66,7 +66,7 @@ HALF_TURN, QUARTER_TURN = Axes((0, 1, 2), (1.0, -1.0, -1.0)), Axes((1, 0, 2), (-
 class DeclaredFrame(NamedTuple):
     """A frame of reference velocities: the core's frame, and the axes from which messages are converted to it.
 
-    body_axes: flu or frd, if the body's axes are named; empty for those of base_frame.
+    body_axes: flu or frd, if the body's axes are named; empty for the axes of base_frame.
     """
 
     frame: VelocityFrame
@@ -291,10 +291,11 @@ class MessageDecoder:
 
     def undecodable(self, stream: Stream, reason: str) -> Refusal:
         """Note a message that could not be decoded."""
-        self._problem(f"{stream.value} undecodable", finding("MESSAGE_UNDECODABLE", stream=stream.value, reason=reason))
+        self._report(f"{stream.value} undecodable", finding("MESSAGE_UNDECODABLE", stream=stream.value, reason=reason))
         return Refusal(INVALID)
 
     def _stamp_ns(self, stream: Stream, header: Any, received_ns: int) -> int:
+        """Return a message's stamp, or the time of reception if it is zero or to be ignored."""
         stamp = received_ns if self.parameters.restamp == RESTAMP_ALL else stamp_ns(header.stamp)
         if stamp:
             return stamp
@@ -304,7 +305,7 @@ class MessageDecoder:
     def note_zero_stamps(self, stream: Stream, count: int) -> None:
         """Note messages without a stamp, for which the time of reception is used."""
         self.zero_stamps += count
-        self._problem(f"{stream.value} stamp", finding("STAMP_MISSING", stream=stream.value))
+        self._report(f"{stream.value} stamp", finding("STAMP_MISSING", stream=stream.value))
 
     def accepts_dvl_frame(self, frame_id: str) -> bool:
         """Return whether this frame is the DVL's. The first possible frame becomes the DVL's own."""
@@ -315,7 +316,7 @@ class MessageDecoder:
             self.dvl_frame = frame_id
             return True
         expected = self.dvl_frame or "the DVL's own frame (dvl_link)"
-        self._problem("dvl frame", finding("DVL_FRAME", frame_id=frame_id, expected=expected))
+        self._report("dvl frame", finding("DVL_FRAME", frame_id=frame_id, expected=expected))
         return False
 
     def _is_body_or_earth(self, frame_id: str) -> bool:
@@ -324,13 +325,13 @@ class MessageDecoder:
 
     @property
     def turns_dvl(self) -> bool:
-        """Whether the DVL's data are rotated by 180° about x, to the axes of base_frame."""
+        """Return whether the DVL's data are rotated by 180° about x, to the axes of base_frame."""
         return turns_dvl(self.dvl_type, self.dvl_frame or "", self.parameters)
 
     def note_axes(self) -> None:
         """Report a DVL with both its data and its mounting upside down; its frame must be known."""
         if self.turns_dvl and self.parameters.rotation_dvl_from_body[2, 2] < 0.0:
-            self._problem("dvl axes", finding("DVL_TURNED_TWICE", frame_id=self.dvl_frame))
+            self._report("dvl axes", finding("DVL_TURNED_TWICE", frame_id=self.dvl_frame))
 
     @property
     def frame_of_reference(self) -> VelocityFrame | None:
@@ -360,7 +361,7 @@ class MessageDecoder:
             return DeclaredFrame(self.reference_type.reference_frame)
         frame = frame_named(frame_id, (p.base_frame,))
         if frame is None:
-            self._problem("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, base=p.base_frame))
+            self._report("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, base=p.base_frame))
             return None
         return frame.in_base(p.base_axes)
 
@@ -372,9 +373,10 @@ class MessageDecoder:
         self._imu_frame = frame_id
         base = self.parameters.base_frame
         if self.imu_alignment.is_identity and frame_id.lstrip("/") != base.lstrip("/"):
-            self._problem("imu frame", finding("IMU_FRAME", frame_id=frame_id, base=base))
+            self._report("imu frame", finding("IMU_FRAME", frame_id=frame_id, base=base))
 
-    def _problem(self, kind: str, found: Reason) -> None:
+    def _report(self, kind: str, found: Reason) -> None:
+        """Remember a problem, and report it if it is the first of its kind."""
         is_new = kind not in self.problems
         self.problems[kind] = found
         if is_new:  # alternating frames or ever new garbage must not be reported with every message

@@ -136,6 +136,8 @@ class VelocityType:
 
 
 def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
+    """Return the rule that a velocity is not exactly zero on all axes."""
+
     def broken(message: Any, _: Parameters) -> Any:
         velocity = read(message)
         return (velocity.x == 0.0) & (velocity.y == 0.0) & (velocity.z == 0.0)
@@ -264,6 +266,7 @@ bool valid
 
 
 def _dvl_msgs_definition(covariance: str = "", beams: str = "DVLBeam[]", times: str = "") -> str:
+    """Return the definition of a variant of dvl_msgs' DVL message."""
     return (
         "std_msgs/Header header\nfloat64 time\ngeometry_msgs/Vector3 velocity\nfloat64 fom\n"
         f"{covariance}float64 altitude\n{beams} beams\nbool velocity_valid\nint64 status\n{times}string form\n"
@@ -496,8 +499,8 @@ def may_be_recognised(name: str) -> bool:
 def velocity_type(parameter: str, name: str) -> VelocityType:
     """Return the type in parameter dvl_type or gnss_type (package/msg/Name or package/Name). Raises InputError."""
     types = TYPES_OF[parameter]
-    package, _, rest = name.partition("/")
-    found = types.get(f"{package}/msg/{rest.removeprefix('msg/')}")
+    package, _, name_in_package = name.partition("/")
+    found = types.get(f"{package}/msg/{name_in_package.removeprefix('msg/')}")
     if found is None:
         raise InputError(f"{parameter}: {name!r} is none of {', '.join(types)}")
     return found

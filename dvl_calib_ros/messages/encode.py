@@ -128,6 +128,7 @@ class SampleWriter:
         return written
 
     def _twist(self, sample: DvlSample | ReferenceSample, frame_id: str) -> Any:
+        """Return a velocity and its covariance as TwistWithCovarianceStamped."""
         types = self._types
         vector = types["geometry_msgs/msg/Vector3"]
         covariance = np.zeros((6, 6))

@@ -97,6 +97,7 @@ def _reader(fields: FieldMap) -> Callable[[Any], Any]:
         return [getter(message) for getter in getters.get(key, ())]
 
     def adapted(message: Any) -> Any:
+        """Return header, velocity, covariance and validity of a message by the map."""
         header = getattr(message, "header", None)
         stamp = _stamp(read("stamp", message) or ([header.stamp] if header is not None else [0.0]))
         frame = read("frame", message) or ([header.frame_id] if header is not None else [""])
@@ -161,8 +162,8 @@ class _Fields(NamedTuple):
 
     def of(self, description: Description) -> dict[str, Description]:
         """Return a message's fields by name; empty for other descriptions."""
-        kind, what = description
-        known = self.store.fielddefs.get(what) if kind == NAME else None
+        kind, detail = description
+        known = self.store.fielddefs.get(detail) if kind == NAME else None
         return {} if known is None else dict(known[1])
 
     def at(self, description: Description, path: str) -> Description | None:
@@ -181,12 +182,12 @@ class _Fields(NamedTuple):
                 yield from self.walk(each, f"{prefix}{name}.")
 
     def is_number(self, description: Description) -> bool:
-        kind, what = description
-        return bool(kind == BASE and what[0] != "string")
+        kind, detail = description
+        return bool(kind == BASE and detail[0] != "string")
 
     def is_array(self, description: Description) -> bool:
-        kind, what = description
-        return kind in (ARRAY, SEQUENCE) and self.is_number(what[0])
+        kind, detail = description
+        return kind in (ARRAY, SEQUENCE) and self.is_number(detail[0])
 
     def is_vector(self, description: Description) -> bool:
         fields = self.of(description)
@@ -194,16 +195,16 @@ class _Fields(NamedTuple):
 
     def element(self, description: Description) -> Description | None:
         """Return the element type of a list of messages; None for other descriptions."""
-        kind, what = description
-        is_list = kind in (ARRAY, SEQUENCE) and what[0][0] == NAME
-        return what[0] if is_list else None
+        kind, detail = description
+        is_list = kind in (ARRAY, SEQUENCE) and detail[0][0] == NAME
+        return detail[0] if is_list else None
 
 
 def misfit(text: str, store: Typestore, msgtype: str) -> str:
     """Return an error text on the first unsuitable path of a map; '' if the map fits."""
-    fields, whole = _Fields(store), (NAME, msgtype)
+    fields, root = _Fields(store), (NAME, msgtype)
     for key, paths in field_map(text).items():
-        within: Description | None = whole
+        within: Description | None = root
         for place, path in enumerate(paths):
             found = fields.at(within, path)
             if found is None:

@@ -81,6 +81,7 @@ class MessageFeed:
         return sample
 
     def _fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
+        """Feed a position (degrees, m) with its variance (3,) m²."""
         if self.kept.is_kept:
             self._fixes.append((stamp_ns, position, variance))
         else:
@@ -158,7 +159,7 @@ class KeptMessages(RowTable):
 
     @property
     def is_kept(self) -> bool:
-        """Whether all messages so far are kept."""
+        """Return whether all messages so far are kept."""
         return self._is_kept
 
     @property
@@ -167,6 +168,7 @@ class KeptMessages(RowTable):
         return Streams(*map(self._block, Stream)) if self._is_kept else None
 
     def _block(self, stream: Stream) -> SampleBlock:
+        """Return all kept samples of one stream."""
         (at,) = np.nonzero(self.stream[: self.size] == _CODES[stream])
         given = self.has_covariance[at]
         each = Covariances.of(self.covariance[at[given]], int(given.sum()))

@@ -38,7 +38,7 @@ Place = tuple[float, float, float]
 
 
 class PositionType(NamedTuple):
-    """How to read positions from messages of a type.
+    """Functions that read positions from messages of a type.
 
     is_valid: message -> whether it has a position. place: message -> three numbers. covariance: message -> of east,
     north, up, 9 numbers or 36 of a pose, m²; None if not given. between: two places -> vector from one to the other, m.
@@ -143,6 +143,7 @@ def _of_pose(message: Any) -> Place:
 
 
 def _pose_covariance(message: Any) -> Any:
+    """Return the covariance (36,) of a pose; None if missing or not positive."""
     if not hasattr(message.pose, "covariance"):
         return None
     given = np.asarray(message.pose.covariance, dtype=float)

@@ -37,7 +37,9 @@ class OfWater(NamedTuple):
     std: float = 0.0
 
 
-def _used(field: str) -> Callable[[Any], float]:
+def _sound_speed_in_use(field: str) -> Callable[[Any], float]:
+    """Return a reader of the speed of sound that the velocities depend on; nan for a phased array."""
+
     def read(message: Any) -> float:
         # the horizontal velocities of a phased array do not depend on the speed of sound
         is_phased = getattr(message, "dvl_type", 0) == _PHASED_ARRAY
@@ -50,8 +52,8 @@ _OF_TYPES: Mapping[str, Mapping[str, Callable[[Any], float]]] = {
     "sensor_msgs/msg/Temperature": {"temperature": attrgetter("temperature")},
     "sensor_msgs/msg/FluidPressure": {"pressure": attrgetter("fluid_pressure")},
     "ds_sensor_msgs/msg/Ctd": {"temperature": attrgetter("temperature"), "salinity": attrgetter("salinity")},
-    "marine_acoustic_msgs/msg/Dvl": {"used": _used("sound_speed")},
-    "ds_sensor_msgs/msg/Dvl": {"used": _used("speed_sound")},
+    "marine_acoustic_msgs/msg/Dvl": {"used": _sound_speed_in_use("sound_speed")},
+    "ds_sensor_msgs/msg/Dvl": {"used": _sound_speed_in_use("speed_sound")},
 }
 
 
@@ -68,9 +70,9 @@ def readers(topic: str, msgtype: str) -> Mapping[str, Callable[[Any], float]]:
 class WaterCollector:
     """Collector of one topic's last `most` readings."""
 
-    def __init__(self, topic: str, msgtype: str, most: int | None = None) -> None:
+    def __init__(self, topic: str, msgtype: str, max_readings: int | None = None) -> None:
         self._topic, self._readers = topic, readers(topic, msgtype)
-        self._values: dict[str, deque[float]] = {kind: deque(maxlen=most) for kind in self._readers}
+        self._values: dict[str, deque[float]] = {kind: deque(maxlen=max_readings) for kind in self._readers}
         self._variance = 0.0
 
     def add(self, message: Any) -> None:

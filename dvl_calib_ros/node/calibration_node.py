@@ -95,7 +95,7 @@ class CalibrationNode(AnsweringNode):
         kalman.prepare()
         self._worker = ThreadPoolExecutor(1, "g2")
         self._initial = initial
-        self._begin(parameters, initial)
+        self._start(parameters, initial)
         # a saved calibration belongs to the mounting that it was saved with
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
@@ -209,15 +209,15 @@ class CalibrationNode(AnsweringNode):
             old = self._inputs[name_used]
             self._subscribe(classes[name_used], name_used)
             self.destroy_subscription(old)
-        self._begin(parameters, self._initial)
+        self._start(parameters, self._initial)
         self._adapted = self._feed.decoder.adapted
         self._awaits_heading_std = self._awaits_heading_std and "heading_deviation_std" not in discovery.values
         now_s = self._pauses.running_s(steady_s())
-        heard = {name_used: subscription.topic_name for name_used, subscription in self._inputs.items()}
-        self._silence, self._recent, self._card = Silence(now_s, heard), RecentCounts(), Card(now_s)
+        subscribed = {name_used: subscription.topic_name for name_used, subscription in self._inputs.items()}
+        self._silence, self._recent, self._card = Silence(now_s, subscribed), RecentCounts(), Card(now_s)
         self._correction, self._mounting_published = None, ("", 0)
 
-    def _begin(
+    def _start(
         self, parameters: Parameters, initial: Mapping[str, GaussianState] | None, feed: MessageFeed | None = None
     ) -> None:
         """Start a calibration with these parameters. feed: its earlier messages are fed again."""
@@ -233,12 +233,12 @@ class CalibrationNode(AnsweringNode):
 
         message: the DVL message that is fed next.
         """
-        if self._transforms is None or not self._transforms.heard:
+        if self._transforms is None or not self._transforms.n_messages:
             return
         decoder = self._feed.decoder
         _, reference, imu = decoder.frame_ids
         dvl = decoder.dvl_frame or frame_name(decoder.dvl_type.frame_id(message))
-        tried = (self._transforms.heard, (dvl, reference, imu))
+        tried = (self._transforms.n_messages, (dvl, reference, imu))
         if tried == self._transforms_tried:
             return
         self._transforms_tried = tried
@@ -256,8 +256,8 @@ class CalibrationNode(AnsweringNode):
         self._restart(parameters.replace(**found.values))
 
     def _restart(self, parameters: Parameters, feed: MessageFeed | None = None) -> None:
-        """Restart as `_begin`, without the previous initial calibration and published values."""
-        self._begin(parameters, None, feed)
+        """Restart as `_start`, without the previous initial calibration and published values."""
+        self._start(parameters, None, feed)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         self._recent, self._correction = RecentCounts(), None
         self._mounting_published = self._iac_published = ("", 0)
@@ -268,6 +268,7 @@ class CalibrationNode(AnsweringNode):
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def _log_configuration(self) -> None:
+        """Log the model and all parameters that differ from their defaults."""
         default = Parameters().as_dict()
         given = self._calibrator.parameters.as_dict()
         changed = ", ".join(f"{name}: {value}" for name, value in given.items() if value != default[name])
@@ -333,6 +334,7 @@ class CalibrationNode(AnsweringNode):
         return 0 if believed and (stamp.sec or stamp.nanosec) else self.get_clock().now().nanoseconds
 
     def _feed_dvl(self, message: Any, received_ns: int) -> None:
+        """Feed a DVL message, and publish its corrected velocity."""
         self._update_mounting(message)
         self._subtract_clock_offsets()
         self._newest_dvl = message
@@ -341,6 +343,7 @@ class CalibrationNode(AnsweringNode):
             self._publish_corrected(sample)
 
     def _feed_imu(self, message: Any, received_ns: int) -> None:
+        """Feed an IMU message, also to the check of gravity."""
         if self._awaits_heading_std:
             self._use_claimed_heading_std(message)
         self._gravity.add(message)
@@ -348,13 +351,13 @@ class CalibrationNode(AnsweringNode):
 
     def _use_claimed_heading_std(self, message: Any) -> None:
         """Restart with the heading accuracy in the first IMU message that states one, as a replay does."""
-        claimed = math.sqrt(heading_variance(message.orientation_covariance))
-        if math.isnan(claimed):
+        reported = math.sqrt(heading_variance(message.orientation_covariance))
+        if math.isnan(reported):
             return
         self._awaits_heading_std = False
-        std = believed_heading(claimed)
+        std = believed_heading(reported)
         if std is not None:
-            self._begin(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial, self._feed)
+            self._start(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial, self._feed)
 
     # ------------------------------------------------------------------ output
 
@@ -364,6 +367,7 @@ class CalibrationNode(AnsweringNode):
             self._publish_estimate()
 
     def _publish_estimate(self) -> None:
+        """Publish the errors estimated by the selected model, and use them for the following samples."""
         calibrator = self._calibrator
         model = MODELS[calibrator.selected]
         self._published = (model.name, calibrator.n_given(model.name))
@@ -431,6 +435,7 @@ class CalibrationNode(AnsweringNode):
         self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
 
     def _subtract_clock_offsets(self) -> None:
+        """Restart with the discovered clock offsets subtracted, once two estimates agree."""
         calibrator = self._calibrator
         parameters = self._late_clocks.parameters(calibrator.registration_so_far, calibrator.parameters)
         if parameters is not None:
@@ -448,7 +453,7 @@ class CalibrationNode(AnsweringNode):
         problems = [*self._found, *decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)
         problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
-        self._hear_water()
+        self._read_water()
         if self._save_problem:
             problems.append(self._save_problem)
         now_s = self._pauses.running_s(steady_s())
@@ -461,12 +466,13 @@ class CalibrationNode(AnsweringNode):
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
 
-    def _hear_water(self) -> None:
+    def _read_water(self) -> None:
         subscribed = [subscription.topic_name for subscription in self._inputs.values()]
         dvl = (self._inputs["dvl/twist"].topic_name, self._feed.decoder.dvl_type.name, self._newest_dvl)
         self._water, self._newest_dvl = self._water_heard.hear(subscribed, dvl), None
 
     def _topic_problems(self) -> list[Reason]:
+        """Return the problems with publishers and subscribers of all topics."""
         type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
         problems: list[Reason] = []
         for topic, subscription in self._inputs.items():
@@ -478,6 +484,7 @@ class CalibrationNode(AnsweringNode):
     # ------------------------------------------------------------------ services, parameters
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Forget all samples and restart from the parameters' prior."""
         self._calibrator.reset()
         self._feed.forget()
         self._gravity = GravitySeen()
@@ -508,6 +515,7 @@ class CalibrationNode(AnsweringNode):
         return response
 
     def _save(self, path: Path, save: Callable[..., None] = save_unless_worse) -> None:
+        """Save the result and publish the mounting. Raises InputError, after noting it for /diagnostics."""
         self._save_problem = None
         try:
             with self._calibrator.settled():  # what is published is what is saved
@@ -530,8 +538,9 @@ class CalibrationNode(AnsweringNode):
             check_outputs({"result_file": Path(name)}, self._parameter_files)
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Refuse changed parameters that are invalid, or a result file that cannot be written."""
         try:
-            changed = self._changed(parameters)
+            changed = self._changed_parameters(parameters)
             check_model(changed)
             if changed.result_file != self._calibrator.parameters.result_file and changed.result_file:
                 check_in_folder(Path(changed.result_file), self._result_folder)
@@ -541,14 +550,15 @@ class CalibrationNode(AnsweringNode):
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
+        """Use changed parameters, and publish the estimate if they select another model."""
         before = self._calibrator.selected
-        self._calibrator.set_parameters(self._changed(parameters))
+        self._calibrator.set_parameters(self._changed_parameters(parameters))
         self._feed.decoder.parameters = self._calibrator.parameters
         if self._calibrator.selected != before:
             self.info(f"running {self._calibrator.selected} instead of {before}")
             self._publish_estimate()
 
-    def _changed(self, parameters: list[Parameter]) -> Parameters:
+    def _changed_parameters(self, parameters: list[Parameter]) -> Parameters:
         return self._calibrator.parameters.replace(
             **{parameter.name: parameter.value for parameter in parameters if parameter.name in SCHEMA}
         )

@@ -25,7 +25,7 @@ from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import arrival_offset
 from ..calibration.results.results import Estimate, scale_and_delay
-from ..calibration.streams.aligner import whereabouts
+from ..calibration.streams.aligner import counts_by_use
 from ..errors import printable
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
@@ -108,12 +108,12 @@ class Silence:
         """Return the fault of each faulty stream. counts: the calibrator's current ones."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
-            lost = _NOT_TAKEN | calibrator.refused_as[stream]
-            taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
+            lost = _NOT_TAKEN | calibrator.reason_of_refusal[stream]
+            used = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
             before = self._seen.get(stream)
-            if before is None or before.taken != taken:
+            if before is None or before.taken != used:
                 first_s = before.first_s if before and before.taken else now_s
-                self._seen[stream] = _Taken(taken, now_s, first_s, newest_ns["dvl"])
+                self._seen[stream] = _Taken(used, now_s, first_s, newest_ns["dvl"])
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
         for stream, (code, own_topic) in _SILENT.items():
@@ -185,7 +185,7 @@ def diagnose(
     if any(each.code == "REFERENCE_FRAME" for each in problems):  # the receiver works: its messages are refused
         found = [each for each in found if not each.code.startswith("GNSS_OUTAGE")]
     found.sort(key=lambda each: (each.severity is not Severity.ERROR, each.code not in _CAUSES))
-    status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
+    status = DiagnosticStatus(level=_status_level(found), hardware_id="dvl")
     status.message = printable("; ".join(map(str, found))) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
@@ -209,7 +209,7 @@ def diagnose(
     return status
 
 
-def _level(found: Sequence[Reason]) -> bytes:
+def _status_level(found: Sequence[Reason]) -> bytes:
     if not found:
         return DiagnosticStatus.OK
     return DiagnosticStatus.ERROR if found[0].severity is Severity.ERROR else DiagnosticStatus.WARN
@@ -264,6 +264,7 @@ def _scale_and_delay_values(estimate: Estimate, parameters: Parameters) -> dict[
 
 
 def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
+    """Return the cause of the scale error and the speed of sound to set, as text."""
     if cause is None:
         return {}
     setting = "-" if math.isnan(cause.setting) else f"{cause.setting:.1f}"
@@ -275,9 +276,10 @@ def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
 
 
 def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) -> dict[str, str]:
+    """Return the counts of samples by use, and of messages by stream and reason, as text."""
     values, model = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}, MODELS[estimate.model]
     if not model.from_positions:  # these models use positions instead of DVL samples
-        where = whereabouts(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
+        where = counts_by_use(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
         values |= {f"samples {name}": str(count) for name, count in where.items()}
     for stream, tally in counts.items():
         for name, count in tally.items():

@@ -81,14 +81,14 @@ class ReceivingExecutor(SingleThreadedExecutor):
         self.add_node(node)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
-        """Create a task as rclpy; from any thread."""
+        """Create a task, as rclpy's executor does. Any thread may call this."""
         task = super().create_task(callback, *args, **kwargs)
         self._unfinished.append(task)
         self._woken.trigger()
         return task
 
     def wake(self) -> None:
-        """Wake up as rclpy; called after the node created or destroyed an entity."""
+        """Wake the executor up. rclpy calls this after the node created or destroyed an entity."""
         self._waiting = None
         super().wake()
         self._woken.trigger()

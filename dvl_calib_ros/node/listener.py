@@ -73,12 +73,14 @@ class Listener:
         client.call_async(Trigger.Request()).add_done_callback(self._on_answer)
 
     def _on_answer(self, future: Any) -> None:
+        """Keep the answer of a service with its time."""
         error = future.exception()
         text = printable(future.result().message if error is None else str(error))
         self.is_waiting = False
         self.answer = f"{time.strftime('%H:%M:%S')} {text}"  # the time distinguishes equal answers
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Keep the newest status of the watched node."""
         for status in message.status:
             if status.name == self._status_name:
                 values = {item.key: item.value for item in status.values}

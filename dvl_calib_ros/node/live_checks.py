@@ -10,7 +10,8 @@ import numpy as np
 
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import rotation_from_rpy
-from ..calibration.registration.registration import ALIKE_S, OFFSETS, Registration
+from ..calibration.registration.clock_drift_and_jumps import REPORTED_FROM_S
+from ..calibration.registration.registration import OFFSETS, Registration
 from ..discovery.gravity import Gravity
 from ..verdict.reasons import Reason, finding
 
@@ -64,20 +65,20 @@ class LateClocks:
         if self.stand or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
-        late = registration.corrections
-        if before is None or not late or not _are_alike(before.corrections, late):
+        corrections = registration.corrections
+        if before is None or not corrections or not _are_alike(before.corrections, corrections):
             return None
         self.stand = True
-        taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in late.items()}
+        offsets = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in corrections.items()}
         self.found = [
             finding("CLOCK_TAKEN_OFF", clock=registration.clock_reason(name), parameter=name, value=seconds)
-            for name, seconds in taken.items()
+            for name, seconds in offsets.items()
         ]
-        return parameters.replace(**taken)
+        return parameters.replace(**offsets)
 
 
 def _are_alike(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    return one.keys() == other.keys() and all(abs(one[name] - other[name]) < ALIKE_S for name in other)
+    return one.keys() == other.keys() and all(abs(one[name] - other[name]) < REPORTED_FROM_S for name in other)
 
 
 # A process that checks its clock every second and finds this much time gone was paused, s.

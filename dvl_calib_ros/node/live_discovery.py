@@ -95,6 +95,7 @@ class Discovering:
         return None
 
     def _may_be_dvl(self) -> list[str]:
+        """Return the published topics whose name or type may be a DVL's."""
         own_prefix = f"{self._node.get_fully_qualified_name()}/"
         return [
             topic
@@ -104,6 +105,7 @@ class Discovering:
         ]  # fmt: skip
 
     def _begin(self, named: Mapping[str, str | None]) -> None:
+        """Start to record the topics into a temporary bag. Raises InputError without rosbags."""
         if named["dvl"] is None:
             others = ", ".join(self._may_be_dvl())
             self._once(self._node.info, f"the DVL's topic has no publisher; examining the others ({others}) ...")
@@ -121,6 +123,7 @@ class Discovering:
         self._recording = _Running(folder, recorder, ends, time.monotonic())
 
     def _outcome(self, looked_through: Future[FoundTopics]) -> FoundTopics | None:
+        """Return the topics found by a finished examination; None while it runs or if it failed."""
         if not looked_through.done():
             return None
         self._looked_through = None
@@ -147,6 +150,7 @@ class Discovering:
     def _look_through(
         self, folder: TemporaryDirectory[str], path: Path, named: Mapping[str, str | None]
     ) -> FoundTopics:
+        """Examine the recorded bag for topics, frames and mounting. Raises InputError."""
         from ..discovery.discover import discover
         from ..discovery.discovery import Given
         from ..recordings.recording import open_recording

@@ -57,13 +57,13 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
             from .calibration_node import CalibrationNode
             from .executor import ReceivingExecutor
     except InputError as error:
-        return _refused(error)
+        return _report_refusal(error)
     if ending.requested:
         return 0
     try:
         rclpy.init(args=["calibration_node", *args], signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises its own types for bad --ros-args and unreadable parameter files
-        return _refused(error)
+        return _report_refusal(error)
     node, is_saved = None, True
     give_back_at_once()
     sys.setswitchinterval(GIVES_WAY_S)
@@ -72,13 +72,13 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         executor = ReceivingExecutor(node)
         gc.freeze()  # objects of the start stay; a collection that examines them would delay a message by 0.01 s
         # spin_until_future_complete would keep one more callback for every message
-        ending.tell(lambda: executor.create_task(lambda: None))
+        ending.call_on_request(lambda: executor.create_task(lambda: None))
         while not ending.requested:
             executor.spin_once()
     except (ParameterError, InputError) as error:
-        return _refused(error)
+        return _report_refusal(error)
     finally:
-        ending.heard()
+        ending.stop_calling()
         if node is not None:
             is_saved = node.finish()
             node.destroy_node()
@@ -99,7 +99,8 @@ def parameter_files(args: Sequence[str]) -> list[Path]:
     return files
 
 
-def _refused(error: Exception | str) -> int:
+def _report_refusal(error: Exception | str) -> int:
+    """Print why the node cannot start. Return exit code 2."""
     from ..standard_streams import say
 
     say(f"calibration_node: {' '.join(str(error).split())}")

@@ -55,6 +55,7 @@ def in_order_of_arrival(
     heads, remaining = dict(taken), at_most
 
     def take_more(names: Iterable[str]) -> bool:
+        """Take the first waiting message of each named input without one. Return whether any arrived."""
         nonlocal remaining
         before = remaining
         for name in names:

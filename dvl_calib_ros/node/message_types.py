@@ -92,7 +92,7 @@ def fill(message: Any, kind: VelocityType, sample: DvlSample | ReferenceSample, 
     if hasattr(message, "child_frame_id"):  # child_frame_id is the frame of the velocity, header.frame_id of the pose
         message.header.frame_id, message.child_frame_id = "odom", DVL_FRAME
         message.pose.pose.orientation.w = 1.0
-    vector = _first(message, _VECTORS)
+    vector = _first_vector(message, _VECTORS)
     vector.x, vector.y, vector.z = (axes @ np.array(sample.velocity)).tolist()
     covariance = None if sample.covariance is None else axes @ np.asarray(sample.covariance) @ axes
     _put_covariance(message, covariance)
@@ -105,7 +105,8 @@ def fill(message: Any, kind: VelocityType, sample: DvlSample | ReferenceSample, 
     return message
 
 
-def _first(message: Any, paths: tuple[str, ...]) -> Any:
+def _first_vector(message: Any, paths: tuple[str, ...]) -> Any:
+    """Return the first vector that exists below these attribute paths. Raises ValueError without any."""
     for path in paths:
         try:
             found = attrgetter(path)(message)
@@ -117,14 +118,15 @@ def _first(message: Any, paths: tuple[str, ...]) -> Any:
 
 
 def _put_covariance(message: Any, covariance: Any) -> None:
+    """Fill the velocity covariance (3, 3) (m/s)² into the fields that the message has."""
     if hasattr(message, "fom"):
         message.fom = 0.0 if covariance is None else math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
     if hasattr(message, "twist"):
         inner = message.twist
         if covariance is not None and hasattr(inner, "covariance"):
-            whole = np.zeros((6, 6))
-            whole[:3, :3] = covariance
-            inner.covariance = whole.ravel()
+            twist_covariance = np.zeros((6, 6))
+            twist_covariance[:3, :3] = covariance
+            inner.covariance = twist_covariance.ravel()
         return
     for name in _COVARIANCES:
         if hasattr(message, name) and covariance is not None:

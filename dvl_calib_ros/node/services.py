@@ -33,6 +33,7 @@ class AnsweringNode(Node):  # type: ignore[misc]
         """Create a service; a request that raises an error is logged and answered with an empty response."""
 
         def answer(request: Any, response: Any) -> Any:
+            """Run the callback; log an error and answer with an empty response if it raises."""
             try:
                 return _printable(callback(request, response))
             except Exception as error:  # rclpy raises ValueError for an unknown parameter type
@@ -45,12 +46,12 @@ class AnsweringNode(Node):  # type: ignore[misc]
     def create_publisher(self, msg_type: Any, topic: str, *arguments: Any, **options: Any) -> Any:
         """Create a publisher. Raises InputError."""
         make = super().create_publisher
-        return _or_refused(topic, lambda: make(msg_type, topic, *arguments, **options))
+        return _create_or_refuse(topic, lambda: make(msg_type, topic, *arguments, **options))
 
     def create_subscription(self, msg_type: Any, topic: str, *arguments: Any, **options: Any) -> Any:
         """Create a subscription. Raises InputError."""
         make = super().create_subscription
-        return _or_refused(topic, lambda: make(msg_type, topic, *arguments, **options))
+        return _create_or_refuse(topic, lambda: make(msg_type, topic, *arguments, **options))
 
 
 def _printable(response: Any) -> Any:
@@ -62,7 +63,8 @@ def _printable(response: Any) -> Any:
     return response
 
 
-def _or_refused(topic: str, make: Callable[[], Any]) -> Any:
+def _create_or_refuse(topic: str, make: Callable[[], Any]) -> Any:
+    """Make a publisher or subscription. Raises InputError for an invalid name or type."""
     try:
         return make()
     # rclpy raises its own type for names, the middleware another for one topic with two types

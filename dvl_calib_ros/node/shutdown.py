@@ -13,9 +13,9 @@ import threading
 from collections.abc import Callable
 from types import FrameType, TracebackType
 
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Interval of repeated calls to functions that have not ended, s: the middleware may lose a wake-up.
-AGAIN_S = 1.0
+REPEATED_EVERY_S = 1.0
 
 
 class Ending:
@@ -32,7 +32,7 @@ class Ending:
     def __init__(self, closed: int | None = None) -> None:
         # no threading.Event: setting it takes a lock, on which a signal handler could block itself
         self._requested = False
-        self._told: list[Callable[[], object]] = []
+        self._functions: list[Callable[[], object]] = []
         self._closed = closed
 
     def __enter__(self) -> Ending:
@@ -40,7 +40,7 @@ class Ending:
         self._writing.setblocking(False)
         # the interpreter writes to it immediately; its own handlers wait until the middleware returns
         self._wakeup_before = signal.set_wakeup_fd(self._writing.fileno(), warn_on_full_buffer=False)
-        self._before = {number: signal.signal(number, self._on_signal) for number in ENDING}
+        self._before = {number: signal.signal(number, self._on_signal) for number in END_SIGNALS}
         self._thread = threading.Thread(target=self._watch, name="ending", daemon=True)
         self._thread.start()
         return self
@@ -57,39 +57,39 @@ class Ending:
 
     @property
     def requested(self) -> bool:
-        """Whether an end was requested."""
+        """Return whether an end was requested."""
         return self._requested
 
-    def tell(self, function: Callable[[], object]) -> None:
-        """Call a function from another thread after a request, repeatedly until `heard`; now if already requested."""
-        self._told.append(function)
+    def call_on_request(self, function: Callable[[], object]) -> None:
+        """Call a function repeatedly, from another thread, from a request until `stop_calling`."""
+        self._functions.append(function)
         if self.requested:
             function()
 
-    def heard(self) -> None:
+    def stop_calling(self) -> None:
         """Stop calling the functions."""
-        self._told.clear()
+        self._functions.clear()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._requested = True
 
     def _watch(self) -> None:
-        """Wait for a signal or hang-up, then call the registered functions, repeatedly until the context is left."""
+        """Wait for a signal or a closed terminal, then call the registered functions repeatedly until `__exit__`."""
         watched = [self._reading.fileno(), *([] if self._closed is None else [self._closed])]
         while True:
-            ready, _, _ = select.select(watched, [], [], AGAIN_S if self.requested else None)
+            ready, _, _ = select.select(watched, [], [], REPEATED_EVERY_S if self.requested else None)
             if not ready:
-                self._tell()
+                self._call()
                 continue
             numbers = self._reading.recv(64) if watched[0] in ready else b"\0"
             if not numbers:  # the context was left
                 return
             if self._closed in ready:
                 watched.remove(self._closed)
-            if self._closed in ready or not set(ENDING).isdisjoint(numbers):
+            if self._closed in ready or not set(END_SIGNALS).isdisjoint(numbers):
                 self._requested = True
-                self._tell()
+                self._call()
 
-    def _tell(self) -> None:
-        for function in list(self._told):
+    def _call(self) -> None:
+        for function in list(self._functions):
             function()

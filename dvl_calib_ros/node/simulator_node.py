@@ -67,13 +67,13 @@ class SimulatorNode(AnsweringNode):
         profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.RELIABLE)
         self._dvl = self.create_publisher(kind, outputs.dvl, profile)
         self._gnss = self.create_publisher(TwistWithCovarianceStamped, outputs.gnss, profile)
-        self._imu = self.create_publisher(Imu, outputs.imu, profile)
+        self._imu_message = self.create_publisher(Imu, outputs.imu, profile)
         self.sent = 0
 
     @property
     def is_heard(self) -> bool:
-        """Whether every topic has a subscriber."""
-        return all(each.get_subscription_count() > 0 for each in (self._dvl, self._gnss, self._imu))
+        """Return whether every topic has a subscriber."""
+        return all(each.get_subscription_count() > 0 for each in (self._dvl, self._gnss, self._imu_message))
 
     def publish(self, samples: Sequence[Sample]) -> None:
         """Publish samples, in order."""
@@ -85,12 +85,12 @@ class SimulatorNode(AnsweringNode):
                     fill(TwistWithCovarianceStamped(), VELOCITY_TYPES[TWIST_TYPE], sample, FRAME_IDS[sample.frame])
                 )
             else:
-                self._imu.publish(_imu(sample))
+                self._imu_message.publish(_imu_message(sample))
             self.sent += 1
 
     def finish(self) -> None:
         """Wait until subscribers have received all messages."""
-        for each in (self._dvl, self._gnss, self._imu):
+        for each in (self._dvl, self._gnss, self._imu_message):
             each.wait_for_all_acked(PATIENCE)
 
     def follow(self, topic: str, scenario: Scenario) -> None:
@@ -158,7 +158,7 @@ def run_until(
         node = SimulatorNode(outputs, max(QUEUE, len(samples)))
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        ending.tell(lambda: executor.create_task(lambda: None))
+        ending.call_on_request(lambda: executor.create_task(lambda: None))
         while wait and not node.is_heard and not ending.requested:
             executor.spin_once(timeout_sec=BREATH_S)
         if follow is not None:
@@ -169,7 +169,7 @@ def run_until(
             _play(node, executor, ending, samples, speed)
         return node.sent
     finally:
-        ending.heard()
+        ending.stop_calling()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
@@ -191,7 +191,8 @@ def _play(
     node.finish()
 
 
-def _imu(sample: Any) -> Any:
+def _imu_message(sample: Any) -> Any:
+    """Return an IMU sample as a message without acceleration."""
     message = Imu()
     set_stamp(message.header.stamp, sample.stamp_ns)
     message.header.frame_id = "base_link"

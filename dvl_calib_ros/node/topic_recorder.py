@@ -75,7 +75,7 @@ class TopicRecorder:
             text, _ = self._writer.typestore.generate_msgdef(kind, ros_version=2)
             definition = Definition(MessageDefinitionFormat.MSG, text)
         channel = Channel(topic, kind, definition)
-        taken = partial(self._take, channel)
+        taken = partial(self._write_message, channel)
         self._subscriptions.append(
             self._node.create_subscription(message_class(topic, kind), topic, taken, profile, raw=True)
         )
@@ -86,7 +86,8 @@ class TopicRecorder:
             self._node.destroy_subscription(each)
         self._subscriptions = []
 
-    def _take(self, channel: Channel, data: bytes) -> None:
+    def _write_message(self, channel: Channel, data: bytes) -> None:
+        """Write a received message and count it, until writing fails."""
         if self.failed is not None:
             return
         try:

@@ -26,13 +26,13 @@ _LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durabil
 
 
 class Transforms:
-    """Subscriber to transforms. `heard` counts its messages, so that callers can skip an unchanged tree."""
+    """Subscriber to transforms. `n_messages` counts its messages, so that callers can skip an unchanged tree."""
 
     def __init__(self, node: Node) -> None:
         self._transforms: dict[str, Any] = {}
         self._own: deque[Any] = deque(maxlen=OWN_TRANSFORMS)
         self._description = ""
-        self.heard = 0
+        self.n_messages = 0
         # every event callback is one more entity that is waited for with every message
         quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
         self._subscriptions = [
@@ -48,14 +48,15 @@ class Transforms:
 
     def _on_description(self, message: Any) -> None:
         self._description = message.data
-        self.heard += 1
+        self.n_messages += 1
 
     def _on_transforms(self, message: Any) -> None:
+        """Keep the newest transform of each child frame, except this node's own."""
         others = [each for each in message.transforms if each not in self._own]
         for each in others:
             if len(self._transforms) < MOST_TRANSFORMS:
                 self._transforms[each.child_frame_id] = each
-        self.heard += bool(others)
+        self.n_messages += bool(others)
 
     def own(self, transform: Any) -> None:
         """Remember an own broadcast: received as another node's, it would restart the calibration."""

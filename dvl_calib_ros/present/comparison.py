@@ -47,7 +47,7 @@ def comparison(result: Comparison) -> Document:
     pairs, ordered = result.pairs, result.calibrations
     by_name = [f"{each.first.name} → {each.second.name}" for each in pairs]
     neighbours = {(id(one), id(other)) for one, other in pairwise(ordered)}
-    near = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
+    adjacent = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
     few = len(pairs) <= MOST_PAIRS
     columns: Columns[Extrinsics] = {
         "": lambda each: each.name,
@@ -84,7 +84,7 @@ def comparison(result: Comparison) -> Document:
             ),
             Section(
                 "Differences, the later less the earlier (neighbours; all pairs: --json)",
-                [] if few else [_differences([pairs[k] for k in near], [by_name[k] for k in near])],
+                [] if few else [_differences([pairs[k] for k in adjacent], [by_name[k] for k in adjacent])],
                 Where.TERMINAL,
             ),
         ],
@@ -104,11 +104,11 @@ DIFFERENCES_NOTE = (
 
 def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Table:
     """Return the table of differences between calibrations, with σ and p of the mounting."""
-    shown = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
+    quantities = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
     columns: Columns[tuple[str, Difference, float]] = {
         "": lambda each: each[0],
         **columns_for(
-            {f"{each.name}, {each.unit}": each for each in shown},
+            {f"{each.name}, {each.unit}": each for each in quantities},
             lambda each, quantity: with_std(
                 quantity.factor * each[1].value[quantity.component],
                 quantity.factor * each[1].std[quantity.component],

@@ -23,23 +23,23 @@ _POINT, _MOVED = "#1f6fb2", "#c0392b"
 PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3
 PNG_DPI = 160
 # with more calibrations than these the alternative text has only the first and the last
-TOLD = 20
+MOST_LISTED = 20
 
 
 def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONENTS)) -> list[Picture]:
     """Draw every quantity observable in two calibrations, one picture each. components: restrict to these."""
-    made = []
+    pictures = []
     for quantity in (each for each in shown_quantities(comparison) if each.component in components):
         at = quantity.component
         known = [each for each in comparison.calibrations if each.shown[at]]
         values_text = ", ".join(
             f"{each.name} {quantity.factor * each.value[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
-            for each in (known if len(known) <= TOLD else (known[0], known[-1]))
+            for each in (known if len(known) <= MOST_LISTED else (known[0], known[-1]))
         )
-        values_text += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
+        values_text += f", and {len(known) - 2} between them" if len(known) > MOST_LISTED else ""
         alt = f"{quantity.name} over time, in {quantity.unit}: {values_text}"
-        made.append(picture(f"{quantity.name.capitalize()}, {quantity.unit}", alt, _panel, comparison, quantity))
-    return made
+        pictures.append(picture(f"{quantity.name.capitalize()}, {quantity.unit}", alt, _panel, comparison, quantity))
+    return pictures
 
 
 def trend_png(comparison: Comparison) -> bytes:
@@ -51,7 +51,7 @@ def trend_png(comparison: Comparison) -> bytes:
         figure = Figure(figsize=(columns * PANEL_WIDTH, rows * PANEL_HEIGHT))
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes, quantity in zip(grid.flat, quantities, strict=False):
-            _draw(axes, comparison, quantity)
+            _draw_quantity(axes, comparison, quantity)
         for axes in list(grid.flat)[len(quantities) :]:
             axes.set_axis_off()
         target = io.BytesIO()
@@ -61,22 +61,22 @@ def trend_png(comparison: Comparison) -> bytes:
 
 def _panel(comparison: Comparison, quantity: ComparedQuantity) -> Figure:
     figure, axes = new_figure(height=PANEL_HEIGHT)
-    _draw(axes, comparison, quantity)
+    _draw_quantity(axes, comparison, quantity)
     return figure
 
 
-def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:
+def _draw_quantity(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:
     """Draw one quantity over time with ±1σ, and a line at each change."""
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
     dated = _dated(comparison.calibrations)
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
     value = quantity.factor * np.array([each.value[quantity.component] for each in known])
     std = quantity.factor * np.array([each.std[quantity.component] for each in known])
-    at = [_middle(each) if dated else float(order[id(each)]) for each in known]
+    at = [_middle_day(each) if dated else float(order[id(each)]) for each in known]
     axes.errorbar(at, value, std, fmt="o", color=_POINT, markersize=4.0, capsize=2.5, elinewidth=1.2)
     changes: Sequence[Change] = getattr(comparison, quantity.changes)
     for index, change in enumerate(changes):
-        ends = [_middle(each) if dated else order[id(each)] for each in (change.last_before, change.first_after)]
+        ends = [_middle_day(each) if dated else order[id(each)] for each in (change.last_before, change.first_after)]
         label = "changed" if index == 0 else None
         axes.axvline(sum(ends) / 2.0, color=_MOVED, linewidth=1.2, linestyle="--", label=label)
     if dated:
@@ -86,8 +86,8 @@ def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> Non
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     else:
         names = [each.name for each in comparison.calibrations]
-        shown = [name if len(name) <= 16 else f"{name[:7]}…{name[-8:]}" for name in names]
-        axes.set_xticks(range(len(names)), shown, rotation=30, ha="right")
+        labels = [name if len(name) <= 16 else f"{name[:7]}…{name[-8:]}" for name in names]
+        axes.set_xticks(range(len(names)), labels, rotation=30, ha="right")
         axes.set_xlim(-0.5, len(names) - 0.5)
     axes.margins(y=0.25)
     axes.set_ylabel(f"{quantity.name}, {quantity.unit}", color=INK)
@@ -100,7 +100,7 @@ def _dated(calibrations: Sequence[Extrinsics]) -> bool:
     return all(before.last_ns <= after.first_ns for before, after in pairwise(calibrations))
 
 
-def _middle(each: Extrinsics) -> float:
+def _middle_day(each: Extrinsics) -> float:
     """Return the middle in days since 1970, matplotlib's unit of dates."""
     return 0.5 * (each.first_ns + each.last_ns) * 1e-9 / 86400.0
 

@@ -65,7 +65,8 @@ TWINS_NOTE = (
 )
 
 
-def _calibration(series: DiagnosisSeries) -> str:
+def _calibration_text(series: DiagnosisSeries) -> str:
+    """Return misalignment and scale error per axis with 1 σ, as a sentence."""
     angle_std, scale_std = np.split(series.calibration_std, 2)
     angles, scales = (
         ", ".join(
@@ -85,7 +86,7 @@ FACTS: Mapping[str, Callable[[DiagnosisSeries], str]] = {
     ),
     "Samples compared": lambda s: f"{len(s.time)}, on the axes {''.join(s.axes)}",
     "Held out": lambda s: "whole recordings in turn" if len(s.recordings) > 1 else "a fifth of the run in turn",
-    "Calibration": _calibration,
+    "Calibration": _calibration_text,
 }
 WHERE: Columns[GapPlace] = {
     "axis": lambda place: f"{place.axis} ({BODY_AXES[place.axis]})",
@@ -112,7 +113,7 @@ NOISE: Columns[NoiseFinding] = {
 
 def first_screen(d: Diagnosis) -> Document:
     """Lay out answer, remedy, cost of the gap and next recording, within 24 rows of a terminal."""
-    whole, gap = diagnosis(replace(d, effects=d.effects[:FIRST_EFFECTS])), d.gap
+    document, gap = diagnosis(replace(d, effects=d.effects[:FIRST_EFFECTS])), d.gap
     more = len(d.effects) - FIRST_EFFECTS
     further = [f"{more} more effects: --verbose."] if more > 0 else []
     if math.isfinite(gap.before):
@@ -120,7 +121,7 @@ def first_screen(d: Diagnosis) -> Document:
         further.append(f"Cost: {cost} mm/s beyond the noise; {mm(gap.not_explained)} mm/s of it are not explained.")
         further += _drift_sentences(d)
     further += [f"Next: {d.next_manoeuvre}.", "Details: --verbose, or --report FILE."]
-    return replace(whole, sections=[section("", *map(Sentence, further))])
+    return replace(document, sections=[section("", *map(Sentence, further))])
 
 
 def diagnosis(d: Diagnosis) -> Document:
@@ -154,7 +155,7 @@ def diagnosis(d: Diagnosis) -> Document:
         answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found, *to_do]),
         warnings=d.notes,
         sections=[
-            section("", Numbers(_numbers(d)) if math.isfinite(d.gap.before) else None),
+            section("", Numbers(_main_numbers(d)) if math.isfinite(d.gap.before) else None),
             section("", *map(Sentence, _drift_sentences(d)), where=Where.PAGE),
             section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
             section("", Warned(), where=Where.PAGE),
@@ -170,7 +171,7 @@ def diagnosis(d: Diagnosis) -> Document:
                 *_equivalence_sentences(d),
                 Sentence(f"Next: {d.next_manoeuvre}."),
                 table_by(NEEDS, d.untestable.items()),
-                table_by(DETECTABLE, _detectable(d), (DETECTABLE_NOTE,)),
+                table_by(DETECTABLE, _detectable_sizes(d), (DETECTABLE_NOTE,)),
             ),
             section("The noise", table_by(NOISE, d.noise)),
         ],
@@ -222,7 +223,8 @@ def _drift_sentences(d: Diagnosis) -> list[str]:
     return [f"Drift per straight km, noise included: {before}" + (f", {after} with the effects." if d.effects else ".")]
 
 
-def _numbers(d: Diagnosis) -> list[Number]:
+def _main_numbers(d: Diagnosis) -> list[Number]:
+    """Return error, closed share of the gap, noise level and unexplained error as main quantities."""
     gap = d.gap
     found = [Number("error", f"{mm(gap.before)} mm/s", note="held-out rms, noise included")]
     if d.effects:
@@ -230,8 +232,8 @@ def _numbers(d: Diagnosis) -> list[Number]:
         found.append(Number("with the effects", f"{mm(gap.after)} mm/s", note="held-out rms, noise included"))
         note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=note))
-    claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white and slow, by likelihood{claimed}"))
+    reported = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white and slow, by likelihood{reported}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="beyond the noise")]
 
 
@@ -248,20 +250,20 @@ def _residual_items(d: Diagnosis) -> Iterator[Item]:
     if series is None:
         yield Sentence(amount)
         return
-    rest = series.rest
-    if rest.found:
-        text = rest.follows.full_sentence.removesuffix(".")
+    unexplained = series.rest
+    if unexplained.found:
+        text = unexplained.follows.full_sentence.removesuffix(".")
     else:
         text = "Nothing in it follows motion or time more than chance would"
-    p = p_value(math.exp(rest.log_p))
+    p = p_value(math.exp(unexplained.log_p))
     yield Sentence(f"{amount} {text} (p {p if p.startswith('<') else f'= {p}'}).")
-    if series.followed:
-        where, followed = series.axes[series.followed.axis], series.followed
+    if series.by_regressor:
+        where, plotted = series.axes[series.by_regressor.axis], series.by_regressor
         yield figure(
-            "diagnosis_pictures.against_what_it_follows",
-            f"Residual {where}, against {followed.label.partition(',')[0]}",
-            f"Residual of the fit {where} against {followed.label}, with means of groups and their standard deviations",
-            followed,
+            "diagnosis_pictures.residual_over_regressor",
+            f"Residual {where}, against {plotted.label.partition(',')[0]}",
+            f"Residual of the fit {where} against {plotted.label}, with means of groups and their standard deviations",
+            plotted,
             f"residual {where}, mm/s",
             caption="Dots: residual, averaged over two samples of the slower stream. Band: standard deviation of a "
             "group about its mean; bars: of the mean, twice.",
@@ -280,7 +282,7 @@ class Detectable(NamedTuple):
     spec: EffectParameter | None
 
     @property
-    def said(self) -> tuple[list[float], str]:
+    def sizes(self) -> tuple[list[float], str]:
         """Detectable and typical size, and their common unit."""
         return quantity((self.size, self.spec.typical), self.spec.unit) if self.spec else ([self.size], "")
 
@@ -291,14 +293,15 @@ DETECTABLE_NOTE = (
 DETECTABLE: Columns[Detectable] = {
     "effect": lambda each: each.effect,
     "smallest size found": lambda each: Cell(
-        f"{each.spec.spoken if each.spec else each.parameter} {three(each.said[0][0])} {each.said[1]}".strip(),
+        f"{each.spec.display_name if each.spec else each.parameter} {three(each.sizes[0][0])} {each.sizes[1]}".strip(),
         "text" if each.spec is None else "text good" if each.size <= each.spec.typical else "text far",
     ),
-    "relevant size": lambda each: f"{two(each.said[0][1])} {each.said[1]}" if each.spec else "–",
+    "relevant size": lambda each: f"{two(each.sizes[0][1])} {each.sizes[1]}" if each.spec else "–",
 }
 
 
-def _detectable(d: Diagnosis) -> Iterator[Detectable]:
+def _detectable_sizes(d: Diagnosis) -> Iterator[Detectable]:
+    """Yield the smallest detectable size of each parameter of each tested effect."""
     for name, sizes in d.minimum_detectable.items():
         specs = {spec.name: spec for spec in EFFECTS[name].parameters} if name in EFFECTS else {}
         for i, (parameter, size) in enumerate(sizes.items()):

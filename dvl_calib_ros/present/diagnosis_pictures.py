@@ -13,7 +13,7 @@ from scipy.signal import welch
 
 from ..calibration.numerics.distributions import normal_isf, normal_sf
 from ..calibration.numerics.frames import Array
-from ..diagnosis.answer.plotted_series import DiagnosisSeries, Followed, HeldOutTwin
+from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin, RegressorPlot
 from .diagnosis import twin_errors
 from .figure_data import CUT_FROM_S, TimeAxis, running_mean
 from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
@@ -52,7 +52,7 @@ def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], poi
         axes.plot(where[kept], mean[kept], color=colour, linewidth=width, label=name)
     axes.axhline(0.0, color=INK, linewidth=0.7)
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     legend_above(axes)
     return figure
 
@@ -162,21 +162,21 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
     return figure
 
 
-def against_what_it_follows(followed: Followed, label: str) -> Figure:
+def residual_over_regressor(plotted: RegressorPlot, label: str) -> Figure:
     """Draw the residual against its explaining variable: samples, group means with two standard errors, and scatter."""
     figure, axes = new_figure(height=3.2)
-    at, mean, std, error = followed.groups()
-    shown = slice(None, None, max(1, len(followed.at) // SCATTER_POINTS))
+    at, mean, std, error = plotted.groups()
+    every = slice(None, None, max(1, len(plotted.at) // SCATTER_POINTS))
     axes.plot(
-        followed.at[shown], MM * followed.left[shown], ".", color=FAINT, markersize=2.5, label="residual", zorder=1,
+        plotted.at[every], MM * plotted.residual[every], ".", color=FAINT, markersize=2.5, label="residual", zorder=1,
         rasterized=True,
     )  # fmt: skip
     axes.fill_between(at, MM * (mean - std), MM * (mean + std), color=AFTER, alpha=0.15, linewidth=0.0, label="σ")
     axes.errorbar(at, MM * mean, 2.0 * MM * error, fmt="o", markersize=4.0, color=AFTER, linewidth=1.2, label="mean")
     axes.axhline(0.0, color=INK, linewidth=0.7)
-    reach = 1.2 * MM * float(np.nanmax([np.quantile(np.abs(followed.left), 0.98), *np.abs(mean) + std]))
+    reach = 1.2 * MM * float(np.nanmax([np.quantile(np.abs(plotted.residual), 0.98), *np.abs(mean) + std]))
     axes.set_ylim(-reach, reach)
-    axes.set_xlabel(followed.label)
+    axes.set_xlabel(plotted.label)
     axes.set_ylabel(label)
     legend_above(axes, markerscale=2.0)
     return figure

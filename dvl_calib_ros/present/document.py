@@ -36,7 +36,7 @@ CELL_KINDS = {Severity.ACCEPT: "good", Severity.MARGINAL: "off", Severity.REJECT
 
 
 class Where(Enum):
-    """Where a section is shown."""
+    """Outputs that show a section: page, terminal or both."""
 
     BOTH = "both"
     TERMINAL = "terminal"

@@ -60,12 +60,12 @@ def scale_terms(model: Model) -> list[Term]:
     return terms
 
 
-def estimate_table(result: Result, shown: Sequence[str]) -> Table:
+def estimate_table(result: Result, models: Sequence[str]) -> Table:
     """Return one row per model, the selected one marked."""
-    per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in shown)
+    per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in models)
     terms = (*ANGLES, *(SCALES if per_axis else (ANY_SCALE,)))
     rows = []
-    for name in shown:
+    for name in models:
         estimate = result.estimates[name]
         nis = f"{estimate.mean_nis / MODELS[name].n_measurement:.2f}" if estimate.used else "–"
         cells = _cells(estimate, terms)
@@ -73,7 +73,7 @@ def estimate_table(result: Result, shown: Sequence[str]) -> Table:
     return Table(
         ("model", *(f"{term.name}, {term.unit.strip()}" for term in terms), "used", "gated", "NIS/m", "convergence"),
         rows,
-        marked=list(shown).index(result.selected),
+        marked=list(models).index(result.selected),
         dense=True,
         notes=(
             "± is the model's 1σ; ? is not observable in this data; – is not estimated. φ and δk are "

@@ -110,15 +110,15 @@ def evaluation(e: Evaluation) -> Document:
             section("", facts_by(FACTS, e)),
             section("", Warned(), where=Where.PAGE),
             section("Velocity error after calibration", *_scores(e)),
-            _by_time(e),
-            *([_converging(e)] if e.convergence else []),
+            _error_by_time(e),
+            *([_convergence(e)] if e.convergence else []),
             section("What was done before", baselines),
             *(
                 section(f"Can the uncertainty be trusted? {title}", *_coverage(found))
                 for title, found in coverages
                 if found
             ),
-            *(_study(e, study, title) for study, title in studies if study is not None and study.runs),
+            *(_single_run_study(e, study, title) for study, title in studies if study is not None and study.runs),
             *([_held_out(e.held_out)] if e.held_out else []),
         ],
         parameters=e.parameters,
@@ -143,9 +143,9 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     if e.own_generator:
         notes.append("The trajectories are simulated: the published figures do not apply to them.")
     if np.isfinite(published).any():
-        near = e.ratio[np.isfinite(e.ratio)]
+        ratios = e.ratio[np.isfinite(e.ratio)]
         notes.append(
-            f"{int((np.abs(near - 1.0) <= 0.25).sum())} of {len(near)} published cells are reproduced within 25 %. "
+            f"{int((np.abs(ratios - 1.0) <= 0.25).sum())} of {len(ratios)} published cells are reproduced within 25 %. "
             "Below each: the published figure and the ratio to it; green within 5 %, yellow 25 %, orange 50 %, red "
             "beyond. Means are over the cells in the row, not the paper's."
         )
@@ -163,7 +163,7 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     )
 
 
-def _by_time(e: Evaluation) -> Section:
+def _error_by_time(e: Evaluation) -> Section:
     """Lay out the error by set and calibration time."""
     rows = [
         (each.name, "all" if window is None else f"{window:g} s", *(number(value, 4) for value in row.tolist()))
@@ -190,34 +190,34 @@ def _by_time(e: Evaluation) -> Section:
     return section("Velocity error against calibration time", Legend(e.models, ""), SideBySide(drawn), table)
 
 
-def _converging(e: Evaluation) -> Section:
+def _convergence(e: Evaluation) -> Section:
     """Lay out the error of the misalignment over time."""
     rows = [
         (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
         for k, seconds in enumerate(TIMES_S)
     ]
     table = Table(("first", *(each.label for each in e.convergence)), rows, notes=(CONVERGENCE_NOTE,), dense=True)
-    shown = [each for each in e.convergence if each.name in MODELS]
+    curves = [each for each in e.convergence if each.name in MODELS]
     drawn = []
     for what, values in (
-        ("Pitch and yaw", [each.level_deg for each in shown]),
-        ("The whole angle", [each.angle_deg for each in shown]),
+        ("Pitch and yaw", [each.level_deg for each in curves]),
+        ("The whole angle", [each.angle_deg for each in curves]),
     ):
-        text = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
+        text = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(curves, values, strict=True))
         drawn.append(
             figure(
                 "evaluation_figures.misalignment_over_time",
                 f"{what}, error against time",
                 f"{what} against time; after {TIMES_S[-1]:g} s {text}",
                 TIMES_S,
-                [each.name for each in shown],
-                [each.gnss_std for each in shown],
+                [each.name for each in curves],
+                [each.gnss_std for each in curves],
                 values,
                 (PUBLISHED_S, PUBLISHED_DEG),
                 caption="rms over runs, combinations of errors and seeds. Star: published for a network.",
             )
         )
-    return section("How fast is the misalignment found?", SideBySide(drawn) if shown else None, table)
+    return section("How fast is the misalignment found?", SideBySide(drawn) if curves else None, table)
 
 
 def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
@@ -252,7 +252,7 @@ def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
     )
 
 
-def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
+def _single_run_study(e: Evaluation, study: EachStudy, title: str) -> Section:
     """Lay out the scores of calibrations on each single run."""
     rows = []
     for run, label, values, observed in zip(

@@ -82,7 +82,7 @@ def explorable(figure: Figure) -> str:
             }
             for line in sorted(lines, key=lambda line: line.get_zorder())
         ],
-        "sleeves": [_sleeve(each) for each in sleeves],
+        "sleeves": [_band_limits(each) for each in sleeves],
     }
     return _packed(plot)
 
@@ -93,15 +93,15 @@ def _packed(plot: dict[str, Any]) -> str:
 
 def _map(figure: Figure, axes: Axes, tracks: Sequence[MapTrack]) -> dict[str, Any]:
     """Return the points of tracks in the picture, per cent from its left and upper edge."""
-    shown = []
+    tracks_in_picture = []
     for track in tracks:
         at = figure.transFigure.inverted().transform(axes.transData.transform(np.column_stack(track.get_data())))
         x, y = 100.0 * at[:, 0], 100.0 * (1.0 - at[:, 1])
-        shown.append({"color": to_hex(track.get_color()), "x": _numbers(x), "y": _numbers(y)})
-    return {"run": tracks[0].run, "times": _numbers(tracks[0].times, 9), "tracks": shown}
+        tracks_in_picture.append({"color": to_hex(track.get_color()), "x": _numbers(x), "y": _numbers(y)})
+    return {"run": tracks[0].run, "times": _numbers(tracks[0].times, 9), "tracks": tracks_in_picture}
 
 
-def _sleeve(area: PolyCollection) -> dict[str, Any]:
+def _band_limits(area: PolyCollection) -> dict[str, Any]:
     """Return the lowest and highest value of a fill_between at each position."""
     vertices = np.asarray(area.get_paths()[0].vertices)
     red, green, blue, alpha = np.asarray(area.get_facecolor(), dtype=float)[0]
@@ -150,9 +150,9 @@ class TimeAxis:
         steps = np.diff(self._seconds)
         recorded = float(steps[steps <= CUT_FROM_S].sum())
         cut = (steps > CUT_FROM_S) & (steps > CUT_SHARE * recorded)
-        shown = np.concatenate([[0.0], np.cumsum(np.where(cut, LEFT_SHARE * recorded, steps))])
-        unit_s, unit = fitting_unit(float(shown[-1]))
-        self._shown = shown / unit_s
+        positions = np.concatenate([[0.0], np.cumsum(np.where(cut, LEFT_SHARE * recorded, steps))])
+        unit_s, unit = fitting_unit(float(positions[-1]))
+        self._shown = positions / unit_s
         self.breaks = np.column_stack([self._shown[:-1][cut], self._shown[1:][cut]])
         self.run = f"{self._first_ns} .. {stamps[-1]}"
         self.label = f"time from the start, {unit}" + (" (gaps cut out)" if cut.any() else "")
@@ -162,7 +162,7 @@ class TimeAxis:
         seconds = (np.asarray(stamps_ns, dtype=np.int64) - self._first_ns) * 1e-9
         return np.asarray(np.interp(seconds, self._seconds, self._shown))
 
-    def dress(self, axes: Axes) -> None:
+    def label_time(self, axes: Axes) -> None:
         """Label the axis and mark omitted time."""
         mark_time(axes, self.run)
         axes.set_xlabel(self.label)

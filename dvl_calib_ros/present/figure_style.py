@@ -81,6 +81,7 @@ class LineStyle(NamedTuple):
 
 
 def _styles() -> dict[str, LineStyle]:
+    """Return the line style of each model: a colour, and dashes by its kind of reference."""
     colours = islice(cycle(_COLOURS), len(MODELS))
     return {
         name: LineStyle(colour, "-." if model.from_positions else "-" if model.aided else "--")

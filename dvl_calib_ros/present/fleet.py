@@ -99,7 +99,7 @@ def fleet(result: Fleet) -> Document:
                 table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=3),
             ),
             *(
-                _trend(each.history.name, each.history.compared)
+                _trend_section(each.history.name, each.history.compared)
                 for each in sitting
                 if each.history.compared is not None
             ),
@@ -145,14 +145,14 @@ class VehicleNow(NamedTuple):
         """Reason for the word, and how many recordings need a person."""
         compared, days = self.history.compared, len(self.history.days)
         if compared is not None:
-            said = reasons(compared)[0].full_sentence
+            sentence = reasons(compared)[0].full_sentence
         elif days:
-            said = "One day alone." if days == 1 else "No angle is observable on two days."
+            sentence = "One day alone." if days == 1 else "No angle is observable on two days."
         else:
-            said = full(self.persons[0].why).partition(". ")[0].removesuffix(".") + "." if self.persons else ""
+            sentence = full(self.persons[0].why).partition(". ")[0].removesuffix(".") + "." if self.persons else ""
         waiting = sum(len(each.recordings) for each in self.persons)
         needs = f"{counted(waiting, 'recording')} {'needs' if waiting == 1 else 'need'} a person."
-        return f"{said} {needs}" if waiting else said
+        return f"{sentence} {needs}" if waiting else sentence
 
     @property
     def urgency(self) -> tuple[int, bool]:
@@ -163,7 +163,7 @@ class VehicleNow(NamedTuple):
         return len(WORDS) if is_same else WORDS.index(self.word), not self.persons
 
     @property
-    def seen_from(self) -> str:
+    def detectable_movement(self) -> str:
         """Detectable movement, degrees, of the least known angle."""
         compared = self.history.compared
         return "–" if compared is None else f"{math.degrees(float(np.nanmax(compared.smallest, initial=0.0))):.1f}"
@@ -186,7 +186,7 @@ VEHICLES: Columns[VehicleNow] = {
     "mounting": lambda each: Cell(
         each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text")
     ),
-    "seen from, °": lambda each: each.seen_from,
+    "seen from, °": lambda each: each.detectable_movement,
     **columns_for(
         {f"{each.name}, {each.unit}": each for each in _ANGLES_AND_SCALE},
         lambda each, quantity: (
@@ -224,11 +224,12 @@ COMPASS: Columns[tuple[str, CompassDeviation]] = {
 }
 
 
-def _trend(name: str, compared: Comparison) -> Section:
-    shown: list[Item] = [Sentence(each.full_sentence) for each in reasons(compared)]
+def _trend_section(name: str, compared: Comparison) -> Section:
+    """Return the section of a vehicle's angles and scale over time."""
+    items: list[Item] = [Sentence(each.full_sentence) for each in reasons(compared)]
     components = tuple(each.component for each in _ANGLES_AND_SCALE)
-    shown.append(figures("comparison_figures.trend", compared, components))
-    return Section(name, shown, Where.PAGE)
+    items.append(figures("comparison_figures.trend", compared, components))
+    return Section(name, items, Where.PAGE)
 
 
 SPEED_NOTE = (
@@ -244,7 +245,7 @@ class VehicleSpeeds(NamedTuple):
     days: Sequence[Extrinsics]
 
     @property
-    def set_to(self) -> float:
+    def recommended_setting(self) -> float:
         """Speed of sound setting of the DVL in the newest recording that has it, m/s; else the default."""
         used = math.nan if self.history.water is None else self.history.water.used
         return SET_SPEED if math.isnan(used) else used
@@ -253,11 +254,11 @@ class VehicleSpeeds(NamedTuple):
 SPEEDS: Columns[VehicleSpeeds] = {
     "": lambda each: each.history.name,
     "days": lambda each: str(len(each.days)),
-    "set to": lambda each: f"{number(each.set_to, 1)} m/s",
+    "set to": lambda each: f"{number(each.recommended_setting, 1)} m/s",
     **columns_for(
         {"lowest": -1, "highest": 0},
         lambda each, at: Cell(
-            f"{number(each.set_to / (1.0 + each.days[at].value[SCALE]), 0)} m/s",
+            f"{number(each.recommended_setting / (1.0 + each.days[at].value[SCALE]), 0)} m/s",
             "",
             f"{with_std(100.0 * each.days[at].value[SCALE], 100.0 * each.days[at].std[SCALE])} %, "
             f"{date(each.days[at].first_ns)[:10]}",

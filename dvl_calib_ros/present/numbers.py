@@ -72,10 +72,10 @@ _SMALL = {"s": (1e3, "ms"), "m/s": (1e3, "mm/s"), "s/h": (1e3, "ms/h")}
 
 def quantity(values: Sequence[float], unit: str) -> tuple[list[float], str]:
     """Convert values to a displayed unit: degrees, ms and mm/s for rad, s and m/s."""
-    factor, spoken = _SPOKEN.get(unit, (1.0, unit))
-    if spoken in _SMALL and 0.0 < max((abs(each) for each in values if math.isfinite(each)), default=0.0) < 1.0:
-        factor, spoken = _SMALL[spoken]
-    return [factor * each for each in values], spoken
+    factor, display_name = _SPOKEN.get(unit, (1.0, unit))
+    if display_name in _SMALL and 0.0 < max((abs(each) for each in values if math.isfinite(each)), default=0.0) < 1.0:
+        factor, display_name = _SMALL[display_name]
+    return [factor * each for each in values], display_name
 
 
 def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffect | None = None) -> str:
@@ -86,17 +86,17 @@ def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffec
     specs = {} if of is None else {each.name: each for each in of.parameters}
     texts = []
     for name, values in parameters.items():
-        label, unit = (specs[name].spoken, specs[name].unit) if name in specs else (name, "")
+        label, unit = (specs[name].display_name, specs[name].unit) if name in specs else (name, "")
         (value, low, high), unit = quantity(values, unit)
         half = 0.5 * (high - low)
         if math.isfinite(half) and half > 0.0:
             exponent = math.floor(math.log10(half))
             digits = max(0, (half < 3.0 * 10.0**exponent) - exponent)  # two digits of a half from 1 to 3, else one
-            shown = [number(each, digits) for each in (value, low, high)]
+            words = [number(each, digits) for each in (value, low, high)]
         else:
-            shown = [three(each) for each in (value, low, high)]
+            words = [three(each) for each in (value, low, high)]
         space = "" if unit.startswith("°") else " "
-        texts.append(" ".join(f"{label} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
+        texts.append(" ".join(f"{label} {words[0]}{space}{unit} ({words[1]} to {words[2]})".split()))
     return "; ".join(texts) or "–"
 
 

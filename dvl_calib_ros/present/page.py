@@ -48,6 +48,7 @@ def plain(value: Any) -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
+    """Return the template engine with the filters of the pages."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("dvl_calib_ros.present"),
         autoescape=True,

@@ -103,7 +103,8 @@ STREAMS: Columns[tuple[str, Mapping[str, int]]] = {
 _STREAMS = (("dvl", "DVL"), ("reference", "GNSS velocity"), ("imu", "IMU"), ("pairing", "pairing of DVL and GNSS"))
 
 
-def _when(run: Replayed) -> str:
+def _period_text(run: Replayed) -> str:
+    """Return the first and last stamp in UTC and the duration, as text."""
     result = run.result
     if result.first_ns is None or result.last_ns is None:
         return "nothing"
@@ -119,7 +120,7 @@ FACTS: Mapping[str, Callable[[Replayed], str]] = {
         f"{run.result.selected} ({run.result.selected_because.sentence}); {run.result.estimate.convergence.value}"
     ),
     "Angles": lambda run: "against the IMU's heading and level" if run.reference_frame in EARTH else "",
-    "Recorded": _when,
+    "Recorded": _period_text,
     "DVL data": lambda run: run.dvl_data,
     "Samples": lambda run: (
         f"{run.result.counts['dvl']['accepted']} of the DVL, {run.result.counts['pairing']['paired']} with a reference "
@@ -162,7 +163,7 @@ def replayed(
         Commands to type next.
     """
     result, history = run.result, run.history
-    shown = [name for name in result.estimates if name in models or name == result.selected]
+    shown_models = [name for name in result.estimates if name in models or name == result.selected]
     verification = result.verifications.get(result.selected)
     rejected = verification is not None and verification.verdict is Severity.REJECT
     drift = None if rejected else run.navigation
@@ -178,7 +179,7 @@ def replayed(
     return Document(
         title="DVL calibration",
         subtitle=", ".join(map(str, bags)),
-        answer=_answer(verification),
+        answer=_verdict_answer(verification),
         warnings=shown_warnings,
         sections=[
             section(
@@ -208,13 +209,13 @@ def replayed(
                 Commands([("next" if not k else "", each) for k, each in enumerate(commands)]) if commands else None,
                 where=Where.TERMINAL,
             ),
-            section("Held-out verification", *_held_out(result, shown), where=Where.PAGE),
-            section("Estimates", estimate_table(result, shown), where=where),
-            *_over_time(run, shown),
+            section("Held-out verification", *_held_out(result, shown_models), where=Where.PAGE),
+            section("Estimates", estimate_table(result, shown_models), where=where),
+            *_over_time(run, shown_models),
             section("Data", table_by(STREAMS, streams), where=where),
             section(
                 "",
-                figures("replay_figures.data_pictures", result, history, shown) if history else None,
+                figures("replay_figures.data_pictures", result, history, shown_models) if history else None,
                 where=Where.PAGE,
             ),
         ],
@@ -232,12 +233,13 @@ def straight_kilometre(result: Result) -> tuple[float, float]:
     parameters = Parameters.from_mapping(result.parameters)
     ahead, nominal = np.eye(3)[0], parameters.rotation_dvl_from_body
     measured = (1.0 + result.estimate.scale) * (result.estimate.rotation_body_from_dvl(nominal).T @ ahead)
-    off = 1000.0 * float(np.linalg.norm((nominal.T @ measured - ahead)[:2]))
+    error_m = 1000.0 * float(np.linalg.norm((nominal.T @ measured - ahead)[:2]))
     left_open = drift_left_open(result.estimate, parameters)
-    return math.hypot(off, left_open), left_open
+    return math.hypot(error_m, left_open), left_open
 
 
-def _answer(verification: Verification | None) -> Answer:
+def _verdict_answer(verification: Verification | None) -> Answer:
+    """Return the verdict of the held-out data with its reasons and advice."""
     if verification is None:
         return Answer("not verified", Severity.MARGINAL, ["Nothing was held back to verify the calibration on."])
     reasons = [*verification.reasons]
@@ -316,9 +318,9 @@ def _mounting_to_copy(run: Replayed) -> Commands:
     return Commands(lines, on_page=[("tf", static)] if static else [])
 
 
-def _held_out(result: Result, shown: Sequence[str]) -> Iterator[Item]:
+def _held_out(result: Result, models: Sequence[str]) -> Iterator[Item]:
     """Yield the errors of each model's correction on held-out data."""
-    verifications = {name: result.verifications[name] for name in shown if name in result.verifications}
+    verifications = {name: result.verifications[name] for name in models if name in result.verifications}
     judged = {name: each.held_out for name, each in verifications.items() if each.held_out is not None}
     if judged:
         yield Sentence(HELD_OUT_NOTE)
@@ -332,13 +334,13 @@ def _held_out(result: Result, shown: Sequence[str]) -> Iterator[Item]:
         )
 
 
-def _over_time(run: Replayed, shown: Sequence[str]) -> Iterator[Section]:
+def _over_time(run: Replayed, names: Sequence[str]) -> Iterator[Section]:
     """Yield estimates over time and innovations, for models with and without GNSS; velocities."""
     result, history = run.result, run.history
     if history is None:
         return
     for aided, title in FAMILIES:
-        models = [name for name in shown if MODELS[name].aided == aided and result.estimates[name].used]
+        models = [name for name in names if MODELS[name].aided == aided and result.estimates[name].used]
         if models:
             drawn = figures("replay_figures.estimate_pictures", result, history, models)
             yield section(title, Legend(models, result.selected), drawn, where=Where.PAGE)

@@ -67,7 +67,7 @@ def estimate_over_time(
         axes.plot(t, value, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=line.model)
     axes.set_ylim(*_settled_range(lines))
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     return figure
 
 
@@ -96,7 +96,7 @@ def velocity_over_time(
     axes.plot(t, before[kept], color=BAD, linewidth=1.0, label="DVL as measured")
     axes.plot(t, after[kept], color=AFTER, linewidth=1.0, label="DVL corrected")
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     legend_above(axes, markerscale=3.0)
     return figure
 
@@ -113,7 +113,7 @@ def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: A
     spread = 1.2 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.995))
     axes.set_ylim(-spread or -0.01, spread or 0.01)
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     legend_above(axes)
     return figure
 
@@ -134,7 +134,7 @@ def selection_over_time(
     axes.set_yticks(range(len(names) + 1), ["GNSS", *names])
     axes.set_ylim(len(names) + 0.6, -0.6)
     axes.grid(False, axis="y")
-    time.dress(axes)
+    time.label_time(axes)
     return figure
 
 
@@ -164,7 +164,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
     axes.set_yscale("log")
     plain_log_ticks(axes.yaxis)
     axes.set_ylabel("NIS per measured component")
-    time.dress(axes)
+    time.label_time(axes)
     return figure
 
 
@@ -225,14 +225,14 @@ def mounting_pictures(result: Result) -> list[Picture]:
     return [
         picture(
             f"DVL on the vehicle, {where}", f"Axes of the DVL as configured and as found, {where}. {how}",
-            _view, (across, up, parameters.body_axes[up]), nominal, rotation_of(times * turn) @ nominal,
+            _hull, (across, up, parameters.body_axes[up]), nominal, rotation_of(times * turn) @ nominal,
             place or (0.0, 0.0, 0.0), parameters.is_z_down, caption=how,
         )
         for across, up, where in _VIEWS
     ]  # fmt: skip
 
 
-def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
+def _hull(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
     """Draw the DVL's axes on the hull in one view, as configured and as found."""
     across, up, name = axes_of
     figure, axes = new_figure(height=2.6)
@@ -258,14 +258,14 @@ def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Se
 def _axes_of_dvl(axes: Axes, ends: Array, at: tuple[float, float], length: float, colour: str, label: str) -> None:
     """Draw the DVL's axes, ends (2, 3) in this view; one that points at the viewer is omitted."""
     for index, axis in enumerate("xyz"):
-        along = length * ends[:, index]
-        if float(np.hypot(*along)) < 0.3 * length:
+        arrow = length * ends[:, index]
+        if float(np.hypot(*arrow)) < 0.3 * length:
             continue
-        tip = at[0] + along[0], at[1] + along[1]
+        tip = at[0] + arrow[0], at[1] + arrow[1]
         axes.annotate("", tip, at, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.8})
         if colour == AFTER:
-            axes.text(at[0] + 1.15 * along[0], at[1] + 1.15 * along[1], axis, color=colour, ha="center", va="center")
-            axes.update_datalim([(at[0] + 1.3 * along[0], at[1] + 1.3 * along[1])])  # keeps letters off the title
+            axes.text(at[0] + 1.15 * arrow[0], at[1] + 1.15 * arrow[1], axis, color=colour, ha="center", va="center")
+            axes.update_datalim([(at[0] + 1.3 * arrow[0], at[1] + 1.3 * arrow[1])])  # keeps letters off the title
     axes.plot([], [], color=colour, label=label)
     axes.plot(*at, "o", color=colour, markersize=4.0)
 
@@ -310,7 +310,7 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
         lines += axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
     if len(corrected) == 1:
         lines[-1].set(alpha=0.0, label="_corrected")  # the colour bar is the legend
-        _coloured(figure, axes, one)
+        _draw_coloured_track(figure, axes, one)
     if time is not None:
         for line in lines:
             axes.add_line(MapTrack(line, time.run, time(one.stamps_ns)))
@@ -325,13 +325,13 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
     return figure
 
 
-def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
+def _draw_coloured_track(figure: Figure, axes: Axes, one: Navigation) -> None:
     """Draw the corrected track, coloured by its distance from the reference's."""
-    off = np.linalg.norm(one.track_after - one.reference, axis=1)
+    distance = np.linalg.norm(one.track_after - one.reference, axis=1)
     parts = np.stack([one.track_after[:-1], one.track_after[1:]], axis=1)
     track = LineCollection(list(parts), cmap="viridis", linewidths=1.6, zorder=3.0)
-    track.set_array(0.5 * (off[:-1] + off[1:]))
-    track.set_clim(0.0, max(float(off.max()), 1e-3))
+    track.set_array(0.5 * (distance[:-1] + distance[1:]))
+    track.set_clim(0.0, max(float(distance.max()), 1e-3))
     axes.add_collection(track)
     bar = figure.colorbar(track, ax=axes, shrink=0.6, aspect=24, pad=0.02)
     bar.outline.set_visible(False)
@@ -403,7 +403,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
             (navigation.error_before, "before", _COLOURS[2]),
             (navigation.error_after, "after", _COLOURS[0]),
         ):
-            _errors(errors, 1e-9 * (navigation.stamps_ns - first_ns), each, name, colour)
+            _draw_errors(errors, 1e-9 * (navigation.stamps_ns - first_ns), each, name, colour)
         _legend_above(errors)
     errors.set_ylabel("DVL less reference, m/s")
     errors.set_xlabel("time, s")
@@ -412,7 +412,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
     return figure
 
 
-def _errors(axes: Axes, time: Array, error: Array, name: str, colour: str) -> None:
+def _draw_errors(axes: Axes, time: Array, error: Array, name: str, colour: str) -> None:
     """Draw the length of an error (N, 3) as points, with its root mean square."""
     length = np.linalg.norm(error, axis=1)
     rms = float(np.sqrt(np.mean(length**2)))
@@ -444,7 +444,7 @@ def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]
     time = TimeAxis(history.stamps_ns)
     for term in (*ANGLES, *_scales_shown(models)):
         lines = [
-            _line(name, history.models[name], term)
+            _model_line(name, history.models[name], term)
             for name in models
             if MODELS[name].error_terms_from_state[term.row].any()
         ]
@@ -470,7 +470,7 @@ def _scales_shown(models: Sequence[str]) -> list[Term]:
     return [ANY_SCALE]
 
 
-def _line(name: str, history: ModelHistory, term: Term) -> ModelLine:
+def _model_line(name: str, history: ModelHistory, term: Term) -> ModelLine:
     index = state_of(MODELS[name], term)
     return ModelLine(name, term.factor * history.state[:, index], term.factor * history.std[:, index])
 
@@ -503,17 +503,17 @@ def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
     return pictures
 
 
-def data_pictures(result: Result, history: RunHistory, shown: Sequence[str]) -> list[Picture]:
+def data_pictures(result: Result, history: RunHistory, models: Sequence[str]) -> list[Picture]:
     """Draw the use of the samples, and the selected model over time."""
     time = TimeAxis(history.stamps_ns)
-    fates = {fate: [count(result, name) for name in shown] for fate, count in FATES.items()}
+    fates = {fate: [count(result, name) for name in models] for fate, count in FATES.items()}
     ends = [*(segment.from_ns for segment in result.segments[1:]), result.last_ns]
     segments = [(each.model, each.from_ns, end) for each, end in zip(result.segments, ends, strict=False)]
     switches = ", ".join(dict.fromkeys(name for name, _, _ in segments)) or "none"
     return [
         picture(
             "Samples by model", "How many DVL samples each model used, gated or was not given",
-            samples_by_fate, list(shown), fates,
+            samples_by_fate, list(models), fates,
             caption="Not given: without the GNSS velocity or attitude it needs, or in the window of its prior.",
         ),
         picture(

@@ -42,7 +42,7 @@ class Folding:
             yield table
             return
         if table.title:
-            yield _shown(console, table.title, "table.title")
+            yield _rendered(console, table.title, "table.title")
         turned = self._transposed
         groups = _groups(table.columns, needed, width - 1)
         if groups is not None and len(groups) > 2 and len(needed) <= FEW:
@@ -53,11 +53,11 @@ class Folding:
         if turned is not None and sum(_keep_short(console, options, column) for column in turned.columns) + 1 <= width:
             yield turned
         elif groups is None:
-            yield from _lines(console, table)
+            yield from _one_cell_per_line(console, table)
         else:
-            yield from (_part(table, group) for group in groups)
+            yield from (_selected_columns(table, group) for group in groups)
         if table.caption:
-            yield _shown(console, table.caption, "table.caption")
+            yield _rendered(console, table.caption, "table.caption")
 
 
 def _keep_short(console: Console, options: ConsoleOptions, column: Column) -> int:
@@ -90,7 +90,8 @@ def _groups(columns: Sequence[Column], needed: Sequence[int], width: int) -> lis
     return None
 
 
-def _part(table: RichTable, places: Sequence[int]) -> RichTable:
+def _selected_columns(table: RichTable, places: Sequence[int]) -> RichTable:
+    """Copy some columns of a table, by their indices."""
     part = RichTable(box=table.box, show_header=table.show_header, pad_edge=table.pad_edge)
     for at in places:
         column = table.columns[at]
@@ -101,22 +102,23 @@ def _part(table: RichTable, places: Sequence[int]) -> RichTable:
     return part
 
 
-def _lines(console: Console, table: RichTable) -> RenderResult:
+def _one_cell_per_line(console: Console, table: RichTable) -> RenderResult:
+    """Yield the table with each cell on a line of its own, after its column's heading."""
     cells = [list(column.cells) for column in table.columns]
     for values in zip(*cells, strict=True):
         for at, (column, value) in enumerate(zip(table.columns, values, strict=True)):
             if value == "":
                 continue
-            header = _shown(console, column.header)
+            header = _rendered(console, column.header)
             if not isinstance(value, str | Text):
                 yield from (header, value)
             elif at == 0 or not header.plain:
-                yield _shown(console, value, "bold")
+                yield _rendered(console, value, "bold")
             else:
-                yield Text.assemble(" ", header, " ", _shown(console, value))
+                yield Text.assemble(" ", header, " ", _rendered(console, value))
 
 
-def _shown(console: Console, text: Any, style: str = "") -> Text:
+def _rendered(console: Console, text: Any, style: str = "") -> Text:
     """Render a text with its markup as in a table."""
     return console.render_str(text, style=style) if isinstance(text, str) else text
 
@@ -141,7 +143,7 @@ def shown(document: Document) -> Iterator[Any]:
 def answer_shown(document: Document) -> Iterator[Any]:
     """Yield rich's renderables of a document's answer, after the finding that leads it."""
     if document.lead:
-        yield from _found(document.lead)
+        yield from _finding_lines(document.lead)
     answer = document.answer
     if answer is not None:
         sentences = list(answer.sentences)
@@ -166,7 +168,7 @@ def sections_shown(document: Document) -> Iterator[Any]:
             elif isinstance(item, Sentence):
                 yield Text(item.text, "dim" if item.soft else "")
             elif isinstance(item, FindingLine):
-                yield from _found(item.reason)
+                yield from _finding_lines(item.reason)
             elif isinstance(item, Commands):
                 for name, line in item.lines:  # to be copied: never broken
                     yield Text(f"{name:5} {line}", no_wrap=True)
@@ -176,7 +178,8 @@ def sections_shown(document: Document) -> Iterator[Any]:
                 yield rich_table(item.table)
 
 
-def _found(reason: Reason) -> Iterator[Padding]:
+def _finding_lines(reason: Reason) -> Iterator[Padding]:
+    """Yield a finding and, indented below it, remedy and code."""
     from rich.padding import Padding
 
     yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
@@ -187,13 +190,14 @@ def _found(reason: Reason) -> Iterator[Padding]:
 def rich_table(table: Table) -> Folding:
     """Return a table for rich, transposed or folded if the terminal is too narrow."""
     turned = table.transposed
-    return Folding(_made(table), None if turned is None else _made(replace(turned, title="", notes=())))
+    return Folding(_build(table), None if turned is None else _build(replace(turned, title="", notes=())))
 
 
-def _made(table: Table) -> RichTable:
+def _build(table: Table) -> RichTable:
+    """Build the table for rich without fitting it to the terminal."""
     from rich import box
 
-    made = RichTable(
+    built = RichTable(
         show_header=any(_cell(name).plain for name in table.head),
         title=Text(table.title, "table.title") if table.title else None,
         title_justify="left",
@@ -203,13 +207,14 @@ def _made(table: Table) -> RichTable:
     )
     for index, name in enumerate(table.head):
         is_word = index < table.words
-        made.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
+        built.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
     for index, row in enumerate(table.rows):
-        made.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
-    return made
+        built.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
+    return built
 
 
 def _cell(cell: str | Cell) -> Text:
+    """Return a cell as styled text, with its small second line appended."""
     from rich.text import Text
 
     if isinstance(cell, str):

@@ -63,8 +63,8 @@ def distance_bars(names: Sequence[str], distances: Sequence[float], null95: Sequ
     """Draw the energy distance of each model, and its 95 % quantile if both sides are alike."""
     figure, axes = new_figure(height=1.2 + 0.36 * len(names))
     rows = np.arange(len(names))
-    alike = [d <= n for d, n in zip(distances, null95, strict=True)]
-    axes.barh(rows, distances, color=[AFTER if each else BAD for each in alike], height=0.6)
+    indistinguishable = [d <= n for d, n in zip(distances, null95, strict=True)]
+    axes.barh(rows, distances, color=[AFTER if each else BAD for each in indistinguishable], height=0.6)
     axes.vlines(null95, rows - 0.38, rows + 0.38, color=INK, linewidth=1.6)
     axes.set_yticks(rows, names)
     axes.set_ylim(len(names) - 0.4, -0.6)

@@ -294,6 +294,7 @@ class Collector:
         return np.array([self._frames.setdefault(row.tobytes(), len(self._frames)) for row in frame_ids])
 
     def _take_singly(self, part: Part) -> None:
+        """Keep the bytes of messages that have no common layout."""
         data = list(part.data())
         end = self._bytes + np.cumsum([len(each) for each in data], dtype=np.int64)
         self._bytes = int(end[-1])
@@ -363,6 +364,7 @@ def _imu(columns: MessageColumns) -> tuple[Array, Array]:
 
 
 def _covariances(kind: VelocityType, columns: MessageColumns) -> Covariances:
+    """Return the velocity covariances of messages, -1 as index where missing. Raises ValueError."""
     given, n = kind.covariance(columns), len(columns)
     if given is None:
         return Covariances.none(n)
@@ -375,6 +377,7 @@ def _covariances(kind: VelocityType, columns: MessageColumns) -> Covariances:
 
 
 def _broken(kind: VelocityType, columns: MessageColumns, parameters: Parameters) -> Codes:
+    """Return (N,) the number of the first rule that each DVL message breaks, 0 for none."""
     broken = np.zeros(len(columns), dtype=np.uint8)
     if kind.is_dvl:
         for code, rule in enumerate(kind.rules, start=1):
@@ -417,6 +420,7 @@ class GrowingRows:
         self._n += len(rows)
 
     def _spill(self) -> None:
+        """Move the rows in memory to a temporary file."""
         if self._file is None:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115  # until its rows are mapped
         self._file.write(self._rows[: self._n].tobytes())

@@ -140,6 +140,7 @@ class Recording:
         return self._surveyed({name: self.columns[name] for name in named if name in self.columns}, whole=True)
 
     def _surveyed(self, columns: Mapping[str, tuple[TopicColumns, ...]], *, whole: bool) -> Survey:
+        """Return the previews of topics, and why messages of the others cannot be read."""
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
         looks = {
             topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
@@ -517,6 +518,7 @@ def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | Non
 
 
 def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> None:
+    """Raise InputError for a topic of another or of several types; add missing definitions to `found`."""
     for role, wanted in _WANTED.items():
         name = getattr(topics, role)
         held = recording.held.get(name)

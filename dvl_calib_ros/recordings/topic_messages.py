@@ -165,6 +165,7 @@ def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType
 
 
 def _of_rows(rows: Sequence[_Row], width: int, is_imu: bool) -> tuple[Any, ...]:
+    """Convert decoded rows to columns: arrival, log time and stamp (N,), values (N, width), variances (N, 3)."""
     times = (np.array([row[place] for row in rows], dtype=np.int64) for place in range(3))
     values = np.array([row.values for row in rows], dtype=float).reshape(-1, width)
     if is_imu:

@@ -227,6 +227,7 @@ class _Numbers:
         return min(self._names)[1] if self._names else ""
 
     def add_columns(self, part: TopicColumns, at: Index) -> None:
+        """Add the rows of some indices."""
         if not len(at):
             return
         laid = part.laid.part(at)
@@ -270,6 +271,7 @@ class _Numbers:
         return numbers[:7], np.array([numbers[7:]], dtype=float)
 
     def _claimed_variance(self, message: Any) -> float:
+        """Return the variance that a message reports, averaged over axes; nan if missing."""
         if self._kind is None:
             return heading_variance(message.orientation_covariance)
         given = message.covariance if self._kind.position else self._kind.covariance(message)

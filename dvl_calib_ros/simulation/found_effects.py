@@ -46,6 +46,7 @@ def _is_taken(other: Other) -> bool:
 
 
 def _injection(description: DvlDescription, name: str, values: dict[str, float]) -> Injection:
+    """Return a diagnosed effect as an injection. Raises InputError for an unknown effect or value."""
     known: dict[str, AnyEffect] = {**EFFECTS, **NOISE_EFFECTS}
     effect = known.get(name)
     if effect is None:

@@ -18,10 +18,10 @@ FORM = "NAME:PARAMETER=VALUE,PARAMETER=VALUE"
 
 def injection(text: str) -> Injection:
     """Parse ``lever_arm:x_m=0.3,z_m=-0.1``; missing parameters keep their defaults. Raises InputError."""
-    name, _, rest = text.strip().partition(":")
+    name, _, values = text.strip().partition(":")
     effect = _effect(name.strip())
     given: dict[str, str] = {}
-    for assignment in filter(str.strip, rest.split(",")):
+    for assignment in filter(str.strip, values.split(",")):
         parameter, equals, number = (part.strip() for part in assignment.partition("="))
         if not equals:
             raise InputError(f"effect {name}: {assignment.strip()!r} is no PARAMETER=VALUE; it has {_listed(effect)}")
@@ -41,6 +41,7 @@ def injection_of(name: str, given: Mapping[str, float | str]) -> Injection:
 
 
 def _effect(name: str) -> AnyEffect:
+    """Return the effect of a name. Raises InputError."""
     known: dict[str, AnyEffect] = {**EFFECTS, **NOISE_EFFECTS}
     if name not in known:
         raise InputError(

@@ -47,7 +47,7 @@ class MotionSample:
 class Follower:
     """Sensors of a scenario that follow a given motion; stamps are `start_ns` plus the time of the motion.
 
-    Samples equal those of `simulate` for the same motion, except for the random outliers and the IMU's noise. Raises
+    Samples equal the output of `simulate` for the same motion, except for random outliers and the IMU's noise. Raises
     InputError for a noise effect that cannot be generated sample by sample.
     """
 
@@ -113,6 +113,7 @@ class Follower:
                 heapq.heappush(self._pending, (made.stamp_ns, next(self._number), made))
 
     def _disturbed(self, velocity: Array, motion: EffectInput, acts_on: ActsOn) -> Array:
+        """Add the noise effects of one sensor to velocities (N, 3) m/s."""
         for effect, disturbance in self._disturbances:
             if effect.acts_on is acts_on:
                 velocity = disturbance(velocity, motion)

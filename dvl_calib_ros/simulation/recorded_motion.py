@@ -139,6 +139,7 @@ def _last_of_each(blocks: Sequence[SampleBlock]) -> tuple[Stamps, Index]:
 
 
 def _check_topics(recording: MotionSource, topics: Topics, present: Mapping[str, str]) -> None:
+    """Raise InputError unless the recording has a reference and an IMU topic."""
     for name, types in ((topics.gnss, tuple(REFERENCE_TYPES)), (topics.imu, (IMU_TYPE,))):
         if present.get(name) not in types:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(present.items())) or "none"

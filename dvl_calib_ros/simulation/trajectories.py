@@ -101,6 +101,7 @@ def body_rates(time: Array, roll: Array, pitch: Array, yaw_rate: Array) -> Array
 
 
 def _free_legs(rng: np.random.Generator) -> Iterator[Leg]:
+    """Yield legs of random duration, speed and yaw rate without end."""
     while True:
         straight = rng.random() < FREE_STRAIGHT
         yaw_rate = 0.0 if straight else float(rng.uniform(-FREE_YAW_RATE, FREE_YAW_RATE))

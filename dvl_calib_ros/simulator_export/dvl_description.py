@@ -208,13 +208,13 @@ def _of_result(path: Path) -> DvlDescription:
     calibrated = load_calibrated_mounting(path)
     if calibrated.objections:
         raise InputError(f"{path}: {'; '.join(calibrated.objections)}: there is nothing to export")
-    late = calibrated.dvl_time_offset
+    delay = calibrated.dvl_time_offset
     return DvlDescription(
         source=str(path),
         mounting_rpy=_three(rpy_from_rotation(calibrated.rotation_body_from_dvl)),
         lever_arm=_three(calibrated.position or (0.0, 0.0, 0.0)),
         scale=_three(calibrated.scale),
-        others=(Other("dvl_time_offset", {"seconds": late}),) if late else (),
+        others=(Other("dvl_time_offset", {"seconds": delay}),) if delay else (),
         doubts=(
             *calibrated.objections,
             *calibrated.doubts,

@@ -34,7 +34,7 @@ class Settings:
 
     text: the file. found: settings by name from the description. defaults: the simulator's own ones. noise_std: (3,)
     m/s of its axes with these settings; None at the default noise. scale: the common error of all axes. remarks: for
-    the user of the file. represented: which of `scale` and `velocity_bias` are in the file.
+    the user of the file. represented: effects in the file, `scale` or `velocity_bias`.
     """
 
     text: str
@@ -128,19 +128,19 @@ def _noise(settings: Settings, description: DvlDescription) -> list[Missing]:
     """Report axes whose noise differs from the description."""
     if description.noise_std is None or settings.noise_std is None:
         return []
-    has, wanted = np.array(settings.noise_std), np.array(description.noise_std)
-    error = math.sqrt(float(np.abs(has**2 - wanted**2).sum()))
-    if error <= SAME_NOISE * float(np.linalg.norm(wanted)):
+    represented, described = np.array(settings.noise_std), np.array(description.noise_std)
+    error = math.sqrt(float(np.abs(represented**2 - described**2).sum()))
+    if error <= SAME_NOISE * float(np.linalg.norm(described)):
         return []
     text = " and ".join(
-        f"{', '.join(f'{1e3 * value:.1f}' for value in values)} mm/s {what}"
-        for values, what in ((wanted, "found along x, y, z"), (has, "with these settings"))
+        f"{', '.join(f'{1e3 * value:.1f}' for value in values)} mm/s {label}"
+        for values, label in ((described, "found along x, y, z"), (represented, "with these settings"))
     )
     return [Missing("noise", text, error)]
 
 
 def mixed_scale(description: DvlDescription) -> float:
-    """Return the single scale-factor error that best replaces those of the three axes, at the speeds driven."""
+    """Return the single scale error that best replaces the errors of the three axes, at the speeds driven."""
     scale = np.array(description.scale)
     if description.speed is None:
         return float(scale[0])  # ahead, the main direction of vehicles
@@ -170,11 +170,11 @@ def beams_of(noise_std: tuple[float, float, float] | None, default_angle: float)
     """
     if noise_std is None:
         return None
-    across, along = math.hypot(noise_std[0], noise_std[1]) / math.sqrt(2.0), noise_std[2]
-    angle = math.atan2(math.sqrt(2.0) * along, across) if across > 0.0 else 0.0
+    horizontal, vertical = math.hypot(noise_std[0], noise_std[1]) / math.sqrt(2.0), noise_std[2]
+    angle = math.atan2(math.sqrt(2.0) * vertical, horizontal) if horizontal > 0.0 else 0.0
     is_found = PLAUSIBLE_ANGLES[0] <= angle <= PLAUSIBLE_ANGLES[1]
     angle = angle if is_found else default_angle
-    return Beams(angle, is_found, math.sqrt(2.0) * math.sin(angle) * across)
+    return Beams(angle, is_found, math.sqrt(2.0) * math.sin(angle) * horizontal)
 
 
 def equal_std(noise_std: tuple[float, float, float]) -> float:

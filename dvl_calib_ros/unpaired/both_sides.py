@@ -12,7 +12,7 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import SampleBlock, Stamps
 from ..diagnosis.answer.results import Diagnosis
-from ..diagnosis.answer.simulated_twin import simulated, with_quiet_reference
+from ..diagnosis.answer.simulated_twin import simulated, with_denoised_reference
 from ..diagnosis.diagnose import diagnose_recordings
 from ..diagnosis.model.recorded_streams import RecordedStreams, load_recordings, zeros_while_moving
 from ..diagnosis.model.stream_curve import Curve
@@ -76,13 +76,13 @@ def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> Stream
     stamps = np.sort(dvl.stamps_ns[~refused])
     steps = 1e-9 * np.diff(stamps)
     steps = steps[steps > 0.0]
-    usual = float(np.median(steps)) if len(steps) else np.nan
-    gaps = steps[steps > DROPOUT_INTERVALS * usual] if len(steps) else steps
+    interval = float(np.median(steps)) if len(steps) else np.nan
+    gaps = steps[steps > DROPOUT_INTERVALS * interval] if len(steps) else steps
     latency = 1e-9 * (log_ns - dvl.stamps_ns)[sound] if len(log_ns) == len(dvl) else np.zeros(0)
     if len(latency) and abs(float(np.median(latency))) > OTHER_CLOCK_S:
         latency = np.zeros(0)
     values = dvl.values[sound]
-    between = int(np.rint(gaps / usual - 1.0).sum()) if len(gaps) else 0
+    between = int(np.rint(gaps / interval - 1.0).sum()) if len(gaps) else 0
     return StreamFacts(
         steps=steps,
         latency=latency,
@@ -164,12 +164,12 @@ def dithered(recording: RecordedStreams) -> RecordedStreams:
     """Return the recording with white noise added to its DVL, the same at every call."""
     dvl = recording.dvl
     noise = DITHER_MPS * np.random.default_rng(0).standard_normal(dvl.values.shape)
-    return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.claimed, claims=dvl.claims))
+    return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.reported, sample_std=dvl.sample_std))
 
 
 def dvl_residuals(selection: EffectSelection) -> tuple[Array, ...]:
     """Return (N, 3) m/s per recording: recorded minus fitted, DVL frame, with a noise-free reference."""
-    problem = with_quiet_reference(selection.fitter.problem)
+    problem = with_denoised_reference(selection.fitter.problem)
     return tuple(
         recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
         for index, recording in enumerate(problem.recordings)

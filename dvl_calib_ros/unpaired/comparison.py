@@ -80,13 +80,13 @@ class Scatter:
 def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
     """Compare all properties observable on both sides."""
     found: list[Candidate | None] = []
-    both = [scatter(log) for log in (vehicle, simulator)]
-    if all(both) and not (vehicle.exact or simulator.exact):
-        slopes = [slopes_of(side) for side in both]
-        even = at_one_motion(both, slopes)
-        found += [_level(even[0], even[1], axis) for axis in range(3)]
+    sides = [scatter(log) for log in (vehicle, simulator)]
+    if all(sides) and not (vehicle.exact or simulator.exact):
+        slopes = [slopes_of(side) for side in sides]
+        scaled = at_one_motion(sides, slopes)
+        found += [_level(scaled[0], scaled[1], axis) for axis in range(3)]
         found += _growth(slopes)
-        found += [_tails(even[0], even[1])]
+        found += [_tails(scaled[0], scaled[1])]
     found.append(_colour(vehicle, simulator))
     return [each for each in found if each is not None]
 
@@ -122,8 +122,8 @@ def _differences(
         return np.zeros((0, values.shape[1])), np.zeros(0, dtype=np.intp), 1.0
     inner = np.arange(reach, reach + n)
     sums = np.sum([each * values[k : k + n] for k, each in enumerate(w)], axis=0)
-    near = np.abs(time[2 * reach :] - time[:n] - 2 * reach * interval) < 0.5 * interval
-    return sums[near], inner[near], float(np.sqrt(w @ w))
+    adjacent = np.abs(time[2 * reach :] - time[:n] - 2 * reach * interval) < 0.5 * interval
+    return sums[adjacent], inner[adjacent], float(np.sqrt(w @ w))
 
 
 def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:
@@ -213,21 +213,21 @@ def _is_significant(slopes: Slopes, name: str) -> bool:
     return bool(2.0 * norm.sf(abs(value) / std) < GROWS)
 
 
-def at_one_motion(both: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
+def at_one_motion(sides: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
     """Scale the noise to a common motion of both sides, by the significant growth."""
-    columns = [[_covariates(each) for each in side] for side in both]
-    names = [name for name in SPREAD if any(name in of and _is_significant(of, name) for of in slopes)]
-    even = [list(side) for side in both]
+    columns = [[_covariates(each) for each in side] for side in sides]
+    names = [name for name in SPREAD if any(name in slope and _is_significant(slope, name) for slope in slopes)]
+    scaled = [list(side) for side in sides]
     for name in names:
         if not all(name in each for side in columns for each in side):
             continue
-        usual = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
-        for side, of, own_columns in zip(even, slopes, columns, strict=True):
-            if name in of and _is_significant(of, name):
+        mean = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
+        for side, slope, own_columns in zip(scaled, slopes, columns, strict=True):
+            if name in slope and _is_significant(slope, name):
                 for index, each in enumerate(side):
-                    quieter = np.exp(-of[name][0] * (own_columns[index][name] - usual))
+                    quieter = np.exp(-slope[name][0] * (own_columns[index][name] - mean))
                     side[index] = replace(each, values=each.values * quieter[:, None])
-    return even
+    return scaled
 
 
 def _covariates(scattered: Scatter) -> dict[str, Array]:
@@ -335,8 +335,8 @@ def compare(
 ) -> UnpairedComparison:
     """Compare bags of a vehicle with bags of a simulator. Raises InputError if they cannot be compared."""
     real = read_log(vehicle, lambda share: on_progress(0.4 * share), effects, with_series)
-    made = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
-    comparison = compare_logs(real, made, effects)
+    simulated = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
+    comparison = compare_logs(real, simulated, effects)
     on_progress(1.0)
     return replace(comparison, reasons=(*comparison.reasons, *other_frame(vehicle, simulator)))
 
@@ -379,7 +379,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
         rungs=shrunk.rungs,
         floor_mps=shrunk.floor,
         not_shown={
-            side: _not_shown(log.diagnosis, effects) for side, log in (("vehicle", vehicle), ("simulator", simulator))
+            side: _unobserved(log.diagnosis, effects) for side, log in (("vehicle", vehicle), ("simulator", simulator))
         },
         vehicle=vehicle.diagnosis,
         simulator=simulator.diagnosis,
@@ -438,8 +438,8 @@ class _Compared:
         needs = ""
         if status is ComparisonStatus.CANNOT_TELL:
             blind = "simulator" if is_present[0] else "vehicle"
-            least = smallest_difference(vehicle, simulator, len(self.p))
-            smallest = ", ".join(f"{key} {value:.2g}" for key, value in least.items())
+            detectable = smallest_difference(vehicle, simulator, len(self.p))
+            smallest = ", ".join(f"{key} {value:.2g}" for key, value in detectable.items())
             needs = (
                 f"the two logs together would show a difference of {smallest}; with the {blind}: "
                 f"{self._effects[name].manoeuvre}"
@@ -454,7 +454,7 @@ class _Compared:
 
     def untested(self, name: str) -> ComparedEffect:
         """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
-        shown = [side[name].intervals() if name in side else {} for side in self._per_side]
+        sizes = [side[name].intervals() if name in side else {} for side in self._per_side]
         effect = self._effects[name]
         needs = f"no common part of it is observable in both logs: {effect.manoeuvre}"
         for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):
@@ -463,10 +463,11 @@ class _Compared:
                 needs = f"the {side}'s log lacks {'a second recording' if effect.relative_to_first else lacks}"
                 break
         return ComparedEffect(
-            name, ComparisonStatus.CANNOT_TELL, self._equivalent(name), shown[0], shown[1], float("nan"), needs=needs
+            name, ComparisonStatus.CANNOT_TELL, self._equivalent(name), sizes[0], sizes[1], float("nan"), needs=needs
         )
 
     def _equivalent(self, name: str) -> tuple[str, ...]:
+        """Return the effects that either diagnosis cannot distinguish from this one."""
         others: list[str] = []
         for log, renamed in zip(self._logs, self._renamed, strict=True):
             for each in log.diagnosis.effects:
@@ -475,15 +476,17 @@ class _Compared:
         return tuple(dict.fromkeys(others))
 
 
-def _status(there: tuple[bool, bool], differ: bool) -> ComparisonStatus:
-    if there[0] and there[1]:
+def _status(present: tuple[bool, bool], differ: bool) -> ComparisonStatus:
+    """Return the status of an effect from its presence on (vehicle, simulator) and whether the sizes differ."""
+    if present[0] and present[1]:
         return ComparisonStatus.OTHER_SIZE if differ else ComparisonStatus.ALIKE
     if not differ:
         return ComparisonStatus.CANNOT_TELL
-    return ComparisonStatus.MISSING if there[0] else ComparisonStatus.ONLY_SIMULATOR
+    return ComparisonStatus.MISSING if present[0] else ComparisonStatus.ONLY_SIMULATOR
 
 
 def _noise(candidate: Candidate, p: float) -> ComparedNoise:
+    """Return a noise property as compared, at its adjusted p."""
     differ = p < LEVEL and candidate.matters
     status = _status(candidate.there, differ) if any(candidate.there) else ComparisonStatus.ALIKE
     if status is ComparisonStatus.CANNOT_TELL:
@@ -493,7 +496,7 @@ def _noise(candidate: Candidate, p: float) -> ComparedNoise:
     )
 
 
-def _not_shown(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str, str]:
+def _unobserved(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str, str]:
     """Return effects unobservable on a side at relevant sizes -> the smallest detectable size, or the missing data."""
     found = {name: f"needs {needs}" for name, needs in diagnosis.untestable.items()}
     named = {each.name for each in diagnosis.effects}
@@ -507,6 +510,7 @@ def _not_shown(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str,
 def _verdict(
     effects: Sequence[ComparedEffect], noise: Sequence[ComparedNoise], vehicle: Diagnosis, simulator: Diagnosis
 ) -> SimulatorVerdict:
+    """Return the verdict: effects weigh more than noise, and a difference more than missing excitation."""
     if any(each.status.is_claim for each in effects):
         return SimulatorVerdict.DIFFERENT
     if any(each.status.is_claim for each in noise):
@@ -553,6 +557,7 @@ def _reasons(
 
 
 def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedComparison:
+    """Return the comparison if at least one side could not be diagnosed."""
     reasons = tuple(
         finding("SIMULATOR_NOTHING_COMPARED", side=side, why=diagnosis.reasons)
         for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))

@@ -23,7 +23,7 @@ from ..diagnosis.fit.selection_criteria import blocks_of
 from ..diagnosis.model.hypothesis import Values, amplitudes, whose_parameters
 from ..diagnosis.search.arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS
 from ..diagnosis.search.effect_selection import EffectSelection
-from ..diagnosis.search.observable_parameters import somewhere
+from ..diagnosis.search.observable_parameters import default_values
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from .both_sides import Log
@@ -92,7 +92,7 @@ class Size:
 
 
 def compared_names(vehicle: Size, simulator: Size) -> list[str]:
-    """Return the compared parameters: those of both sides and, for an effect found on both, of a second occurrence.
+    """Return the names of parameters on both sides and, for an effect found on both, of a second occurrence.
 
     A side without the second occurrence has 0 for it.
     """
@@ -167,7 +167,7 @@ def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
     known = {**selection.testable, **found}
     chosen = [known[name] for name in names if name in known]
     start: dict[str, tuple[Values, ...]] = {
-        effect.name: tuple(somewhere(effect, fitter.problem)) for effect in chosen if effect.name not in found
+        effect.name: tuple(default_values(effect, fitter.problem)) for effect in chosen if effect.name not in found
     }
     return fitter.fit(fit.hypothesis.with_effects(chosen, len(fit.seen), start), fit.noise)
 

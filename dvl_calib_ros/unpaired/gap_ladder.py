@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
-from ..diagnosis.answer.simulated_twin import simulated, with_quiet_reference
+from ..diagnosis.answer.simulated_twin import simulated, with_denoised_reference
 from ..diagnosis.fit.cross_validation import fitted_without, stretch_of
 from ..diagnosis.model.forward_model import Problem
 from ..diagnosis.model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run
@@ -64,8 +64,8 @@ def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Se
     ]
     ladder = [SimulatedModel(AS_IT_IS, (), kept)]
     for effect in lacking:
-        rest = {name: each for name, each in kept.items() if name != effect.name}
-        ladder.append(SimulatedModel(f"with {effect.name}", (effect,), rest))
+        others = {name: each for name, each in kept.items() if name != effect.name}
+        ladder.append(SimulatedModel(f"with {effect.name}", (effect,), others))
     if len(lacking) != 1 or set(vehicle) != set(lacking) or kept:
         ladder.append(SimulatedModel(ALL, tuple(vehicle), {}))
     return [*ladder, SimulatedModel(NOISE, tuple(vehicle), {}, vehicle_noise=True)]
@@ -130,13 +130,13 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
     for model in ladder:
         is_everything = set(model.added) == set(ladder[-1].added) and not model.kept
         predicted = everything if is_everything else _held_out(selection, model)
-        off = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
+        difference = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
         noise = own_noise if model.vehicle_noise else drawn
-        made = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
-        known = np.isfinite(off).all(axis=1)
-        distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
-        errors[model.name] = off
-        rungs.append(Rung(model.name, _rms(off[known]), distance, null95, p))
+        simulated = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
+        known = np.isfinite(difference).all(axis=1)
+        distance, null95, p = two_samples(recorded[known], simulated[known], windows[known], rng)
+        errors[model.name] = difference
+        rungs.append(Rung(model.name, _rms(difference[known]), distance, null95, p))
     gap = vehicle.diagnosis.gap
     beyond_noise = max(0.0, gap.after**2 - gap.noise_floor**2)
     floor = float(np.sqrt(max(0.0, rungs[-1].error_mps ** 2 - beyond_noise)))
@@ -170,18 +170,18 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     sample_folds = [_fold_of(problem, index) for index in range(n)]
     predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
     # at shifted times the reference's noise is different, so it would count twice
-    quiet = with_quiet_reference(problem)
+    denoised = with_denoised_reference(problem)
     for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
         for index in range(n):
             at = sample_folds[index] == fold
-            predicted[index][at] = simulated(quiet, fitted.hypothesis, index)[at]
+            predicted[index][at] = simulated(denoised, fitted.hypothesis, index)[at]
     return predicted
 
 
-def _fold_of(problem: Problem, index: int) -> Array:
+def _fold_of(problem: Problem, recording: int) -> Array:
     """Return the fold (N,) of each DVL sample of a recording: stretches of time in turn; -1 outside the fit."""
-    time = problem.recordings[index].dvl.time - problem.grids[index].delay_s
-    of = problem.grids[index].bin_time
+    time = problem.recordings[recording].dvl.time - problem.grids[recording].delay_s
+    of = problem.grids[recording].bin_time
     fold = stretch_of(time) % SETTINGS.folds
     inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)
     return np.where(inside, fold, -1)
@@ -190,20 +190,20 @@ def _fold_of(problem: Problem, index: int) -> Array:
 def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Generator) -> list[Array]:
     """Return the slow noise (SIMULATED, N, 3) m/s per recording that simulated reference noise adds to the DVL.
 
-    Fast reference noise is excluded, because `with_quiet_reference` subtracts it.
+    Fast reference noise is excluded, because `with_denoised_reference` subtracts it.
     """
-    quiet = with_quiet_reference(problem)
+    denoised = with_denoised_reference(problem)
     noisy = [
-        with_quiet_reference(
+        with_denoised_reference(
             replace(
                 problem,
-                recordings=tuple(replace(one, reference=one.reference.shaken(rng)) for one in problem.recordings),
+                recordings=tuple(replace(one, reference=one.reference.perturbed(rng)) for one in problem.recordings),
             )
         )
         for _ in range(SIMULATED)
     ]
     return [
-        np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(quiet, hypothesis, index)
+        np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(denoised, hypothesis, index)
         for index in range(len(problem.recordings))
     ]
 
@@ -229,11 +229,11 @@ def turned_over(residual: Array, spectrum: Array, rng: np.random.Generator) -> A
     n = len(residual)
     values = np.nan_to_num(residual - np.nanmedian(residual, axis=0))
     signs = rng.choice([-1.0, 1.0], n)[:, None]
-    near = _limited(values)  # outliers are not coloured
+    limited = _limited(values)  # outliers are not coloured
     gain = np.sqrt(spectrum)
-    white = np.fft.irfft(np.fft.rfft(near, axis=0) / gain, n, axis=0)
-    made = np.fft.irfft(np.fft.rfft(white * signs, axis=0) * gain, n, axis=0)
-    return np.asarray(made + (values - near) * signs)
+    white = np.fft.irfft(np.fft.rfft(limited, axis=0) / gain, n, axis=0)
+    randomised = np.fft.irfft(np.fft.rfft(white * signs, axis=0) * gain, n, axis=0)
+    return np.asarray(randomised + (values - limited) * signs)
 
 
 def _random_noise(pool: Sequence[Array], like: Array, rng: np.random.Generator) -> Array:

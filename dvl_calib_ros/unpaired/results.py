@@ -101,7 +101,7 @@ class ComparedNoise:
 
 @dataclass(frozen=True)
 class Rung:
-    """One model of the vehicle's DVL. name: the original simulator, or the added effects.
+    """One model of the vehicle's DVL. name: the original simulator, or the effects added to it.
 
     error_mps: rms of recorded minus simulated without noise, with limited outliers, on held-out stretches. distance:
     energy distance between windows of both, with noise, in units of their spread. null95: its 95 % quantile if both are

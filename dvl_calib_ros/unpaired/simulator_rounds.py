@@ -41,7 +41,7 @@ MOST_ROUNDS = 9
 # the simulator's velocity is exact: only the corners between its samples are smoothed
 SMOOTHING_S = 0.2
 TRUTH_HZ = 10.0
-# codes of a comparison's reasons that hold beside the differences in effects
+# codes of a comparison's reasons that remain valid next to the differences in effects
 REMAINING = ("SIMULATOR_NOISE", "SIMULATOR_UNKNOWN_REST")
 
 
@@ -93,7 +93,7 @@ class ClosedGap(Answering):
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Return the reduction of the gap, the differences found, and those that the best round still has."""
+        """Return the reduction of the gap, the differences found, and the differences that remain in the best round."""
         first, best = self.rounds[0], self.rounds[self.best]
         if len(self.rounds) == 1:
             return (*first.comparison.reasons, finding("SIMULATOR_NO_ROUNDS"))
@@ -106,8 +106,8 @@ class ClosedGap(Answering):
         found = tuple(each for each in first.comparison.reasons if each.code in (*CLAIMED.values(), "SIMULATOR_FRAME"))
         remaining = tuple(each for each in best.comparison.reasons if each.code in REMAINING)
         names = ", ".join(each.name for each in best.comparison.effects if each.status.is_claim)
-        left = (finding("SIMULATOR_NOT_ADDED", names=names),) if names and self.best else ()
-        return (outcome, *found, *left, *remaining)
+        not_added = (finding("SIMULATOR_NOT_ADDED", names=names),) if names and self.best else ()
+        return (outcome, *found, *not_added, *remaining)
 
 
 def close_gap(
@@ -154,12 +154,12 @@ def close_gap(
     document = None if real.diagnosis.dvl is None else diagnosis_document(real.diagnosis)
     while document is not None and found[-1].claims and len(found) <= rounds:
         if len(found) > 1:
-            corrected = put_right(document, found[-1].comparison, effects)
+            corrected = corrected_document(document, found[-1].comparison, effects)
             if corrected == document:
                 break
             document = corrected
-        made = _simulated(document, len(found), simulator, folder, real.diagnosis)
-        log = read_log(made, part(1 + len(found)), effects)
+        simulated = _simulated(document, len(found), simulator, folder, real.diagnosis)
+        log = read_log(simulated, part(1 + len(found)), effects)
         log = replace(log, facts=tuple(replace(each, latency=np.zeros(0)) for each in log.facts))  # no real log times
         found.append(Round(compare_logs(real, log, effects), document))
     on_progress(1.0)
@@ -200,7 +200,7 @@ def against(
         return close_gap(vehicle, simulator, rounds, Path(folder), on_progress)
 
 
-def put_right(
+def corrected_document(
     document: Mapping[str, Any], comparison: UnpairedComparison, effects: Mapping[str, Effect] = EFFECTS
 ) -> dict[str, Any]:
     """Return a DVL's document corrected by the differences in effects, noise and rate."""
@@ -235,10 +235,10 @@ def put_right(
 def _difference(compared: ComparedEffect, name: str) -> float:
     """Return vehicle minus simulator for a parameter, averaged over recordings; 0 if one side does not have it."""
 
-    def of(side: Mapping[str, Triple]) -> list[float]:
+    def size_on(side: Mapping[str, Triple]) -> list[float]:
         return [value for key, (value, _, _) in side.items() if key == name or key.startswith(f"{name} of ")]
 
-    vehicle, simulator = of(compared.vehicle), of(compared.simulator)
+    vehicle, simulator = size_on(compared.vehicle), size_on(compared.simulator)
     return sum(vehicle) / len(vehicle) - sum(simulator) / len(simulator) if vehicle and simulator else 0.0
 
 

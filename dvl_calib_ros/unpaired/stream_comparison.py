@@ -104,9 +104,9 @@ def _spikes(values: Array) -> int:
     """Count samples far from the prediction by four neighbours, and farther than these."""
     if len(values) < 10:
         return 0
-    off = deviation_from_neighbours(values)
-    scale = np.maximum(robust_std(off), DITHER_MPS)
-    size = (np.abs(off) / scale).max(axis=1)
+    deviation = deviation_from_neighbours(values)
+    scale = np.maximum(robust_std(deviation), DITHER_MPS)
+    size = (np.abs(deviation) / scale).max(axis=1)
     return int(np.count_nonzero((size > OUTLIER) & (size > neighbours(size))))
 
 
@@ -117,12 +117,13 @@ def _exact(vehicle: Log, simulator: Log) -> Candidate | None:
         return None
     how = "without any noise" if simulator.exact or vehicle.exact else "with the noise of its own reference"
     who = "the simulator's" if leaks[1] else "the vehicle's"
-    shown: list[Triple] = [(float(leak),) * 3 for leak in leaks]
+    values: list[Triple] = [(float(leak),) * 3 for leak in leaks]
     p = 0.0 if leaks[0] != leaks[1] else 1.0
-    return Candidate("truth_leaks", "yes", shown[0], shown[1], p, (leaks[0], leaks[1]), note=f"{who} DVL is {how}")
+    return Candidate("truth_leaks", "yes", values[0], values[1], p, (leaks[0], leaks[1]), note=f"{who} DVL is {how}")
 
 
 def _dropouts(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the shares of missing and refused messages."""
     counts = [
         (sum(f.missing + f.refused for f in log.facts), sum(f.received for f in log.facts))
         for log in (vehicle, simulator)
@@ -137,6 +138,7 @@ def _zeros(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _repeats(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the shares of repeated samples; None for a DVL without noise."""
     if vehicle.exact or simulator.exact:
         return None  # at a constant velocity the truth repeats itself
     counts = [(sum(f.repeats for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)]
@@ -144,32 +146,37 @@ def _repeats(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the sample rates, Hz; None if one is unknown."""
     rates = [1.0 / float(np.median([f.interval for f in log.facts])) for log in (vehicle, simulator)]
     if not np.isfinite(rates).all():
         return None
     change = abs(rates[0] / rates[1] - 1.0)
-    shown: list[Triple] = [(rate, rate * (1.0 - 0.5 * RATE_SHARE), rate * (1.0 + 0.5 * RATE_SHARE)) for rate in rates]
-    return Candidate("rate", "Hz", shown[0], shown[1], 0.0 if change > RATE_SHARE else 1.0, matters=change > RATE_SHARE)
+    spans: list[Triple] = [(rate, rate * (1.0 - 0.5 * RATE_SHARE), rate * (1.0 + 0.5 * RATE_SHARE)) for rate in rates]
+    return Candidate("rate", "Hz", spans[0], spans[1], 0.0 if change > RATE_SHARE else 1.0, matters=change > RATE_SHARE)
 
 
 def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
-    def of(log: Log) -> Array:
+    """Compare the standard deviation of the steps between stamps, s."""
+
+    def std_of_steps(log: Log) -> Array:
         return np.concatenate([_blocks(_usual(f.steps), lambda b: np.std(b, axis=1)) for f in log.facts])
 
-    return _compare_times("jitter", of(vehicle), of(simulator), JITTER_S)
+    return _compare_times("jitter", std_of_steps(vehicle), std_of_steps(simulator), JITTER_S)
 
 
 def _usual(steps: Array) -> Array:
     """Return the steps between stamps that are no gap."""
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    return steps[steps < DROPOUT_INTERVALS * usual]
+    interval = float(np.median(steps)) if len(steps) else 0.0
+    return steps[steps < DROPOUT_INTERVALS * interval]
 
 
 def _latency(vehicle: Log, simulator: Log) -> Candidate | None:
-    def of(log: Log) -> Array:
+    """Compare the median delay from stamp to log time, s."""
+
+    def latency_of(log: Log) -> Array:
         return np.concatenate([_blocks(f.latency, lambda b: np.median(b, axis=1)) for f in log.facts])
 
-    return _compare_times("latency", of(vehicle), of(simulator), LATENCY_S)
+    return _compare_times("latency", latency_of(vehicle), latency_of(simulator), LATENCY_S)
 
 
 def _blocks(values: Array, of: Callable[[Array], Array]) -> Array:
@@ -181,14 +188,14 @@ def _compare_times(name: str, vehicle: Array, simulator: Array, threshold_s: flo
     """Compare the means of block values (B,) s of both sides; differences below a threshold do not matter."""
     if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
         return None
-    shown: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
+    means: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
     is_present = tuple(abs(float(each.mean())) > threshold_s for each in (vehicle, simulator))
     gap = abs(float(vehicle.mean() - simulator.mean()))
     return Candidate(
         name,
         "s",
-        shown[0],
-        shown[1],
+        means[0],
+        means[1],
         welch(vehicle, simulator),
         (is_present[0], is_present[1]),
         matters=gap > threshold_s,

@@ -53,9 +53,11 @@ CONFIGURATIONS = on_page(
     ),
     marginal(
         "DVL_SIGN_OPEN",
-        "without a reference the sign of the DVL's {axis} is not observable: negated, the {angle} changes by "
-        "{degrees:.1f}°",
-        remedy="is the DVL's {axis} positive when the vehicle moves {way}? If not, negate it in the DVL's driver",
+        "without a reference the sign of the DVL's {axis} is not observable: negated, {effect}",
+        remedy=(
+            "is the DVL's {axis} positive when the vehicle moves {way}? If so, set dvl_axes to {axes}; if not, negate "
+            "it in the DVL's driver{also}"
+        ),
     ),
     reject(
         "DVL_AXIS_SCALED",
@@ -106,7 +108,7 @@ CONFIGURATIONS = on_page(
     reject(
         "HEADING_CLOCKWISE",
         "a heading that turns against the angular velocity about z, as a compass counts it (clockwise)",
-        means="An ENU yaw is 0 at east and grows to the left.",
+        means="An ENU yaw is 0 at east and grows counter-clockwise.",
     ),
     reject("RATES_NEGATED", "an angular velocity of the other sign"),
     reject(
@@ -134,36 +136,36 @@ CONFIGURATIONS = on_page(
         "an angular velocity whose axes are rotated by {degrees:.0f}° from the attitude's",
         means="Two instruments in one message, or one is corrected for its mounting alone.",
     ),
-    # gravity
-    reject(
+    # gravity; alone it rejects no calibration, as no calibration uses the acceleration
+    accept(
         "GRAVITY_SIGN",
         "{topic}: the IMU's acceleration at rest points down, as gravity with the other sign",
         remedy="correct the IMU's driver",
     ),
-    reject(
+    accept(
         "GRAVITY_UPSIDE_DOWN",
         "{topic}: gravity is upside down in the {where}",
         means="The IMU is upside down, or axes and orientation follow two conventions.",
         remedy="set {parameter} to {value}",
     ),
-    reject(
+    accept(
         "GRAVITY_FITS_INVERTED",
         "{topic}: the IMU's orientation looks inverted: gravity is {given:.1f}° from up, and {inverted:.1f}° with the "
         "quaternion inverted",
         remedy="correct the IMU's driver",
     ),
-    reject(
+    accept(
         "GRAVITY_LEANS",
         "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
         remedy="check the IMU's mounting in its driver",
     ),
-    reject(
+    accept(
         "GRAVITY_IN_G",
         "{topic}: the IMU's acceleration at rest is 1 g and not 9.81 m/s²",
         means="Check the angular velocity too.",
         remedy="let the driver send SI units",
     ),
-    reject(
+    accept(
         "GRAVITY_SIZE",
         "{topic}: the IMU's acceleration at rest is {size:.3g} m/s², which is not gravity",
         means="Gravity is subtracted, or the units are wrong.",
@@ -199,7 +201,7 @@ CONFIGURATIONS = on_page(
     reject(
         "CLOCK_DRIFTS_DVL",
         "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        remedy="synchronise the clocks, or dvl_clock_drift to {drift:.2g}",
+        remedy="synchronise the clocks, or set dvl_clock_drift to {drift:.2g}",
     ),
     reject(
         "CLOCK_LEAPS",
@@ -213,7 +215,7 @@ CONFIGURATIONS = on_page(
         remedy="set that clock; use the recording times for this bag: --restamp log",
     ),
     # declarations of a recording
-    reject(
+    accept(
         "DVL_FRAME_NOT_OWN",
         "{topic}: the DVL's messages carry frame {frame!r} and not one of the DVL's own; the data are used unchanged",
         means="The driver may have rotated the velocity into that frame.",
@@ -225,10 +227,10 @@ CONFIGURATIONS = on_page(
         means="Without an attitude that changes, both fit.",
         remedy="set gnss_frame",
     ),
-    reject(
+    accept(
         "REFERENCE_FRAME_OTHER",
         "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}, which is used",
-        means="A gnss_frame that is given is not questioned.",
+        means="A configured gnss_frame is used without a check.",
         remedy="correct the frame in the reference's driver",
     ),
     reject(
@@ -246,13 +248,13 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_ASTERN",
         "with the mounting {given} the vehicle travels astern; it goes ahead with {found}",
-        means="A vehicle that drives astern looks the same; a mounting given with -p is not questioned.",
+        means="A vehicle that drives astern looks the same; a mounting configured with -p is used without a check.",
         remedy="try -p mounting_rpy:={option}{also}; if the vehicle did drive astern, record it driving ahead",
     ),
     marginal(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and {other} equally well; the first is used",
-        remedy="which side is port on the DVL, and which axes has the reference? Set the one that is right",
+        remedy="is {what} {axes}? If so, set {parameter} to {value}; if not, set it to {first}",
     ),
     reject("TWO_CONTRADICTIONS", "{one}; {other}"),
 )

@@ -100,7 +100,7 @@ FINDINGS = (
     warning(
         "MODEL_RESTARTED",
         "{model}: the filter diverged {count} times and went on from its last good state",
-        means="Data and parameters contradict each other, for instance a wrong mounting without a gate.",
+        means="Data and parameters contradict each other, for instance a wrong mounting with the gate switched off.",
         remedy="check mounting_rpy and lever_arm, and do not switch the gate off (gate_probability 0 or 1)",
     ),
     # two publishers, wrong types, quality of service
@@ -336,7 +336,7 @@ FINDINGS = (
     warning(
         "DVL_BIAS",
         "the DVL has the same velocity error at every speed, {axes} mm/s in the body, which "
-        "looks like {degrees:.1f}° of mounting at the usual speed",
+        "looks like {degrees:.1f}° of misalignment at the usual speed",
         means="A bias of the DVL's electronics, a rounding, or water that moves in its shell.",
         remedy="subtract the bias in the driver, or have the DVL serviced",
     ),
@@ -366,12 +366,6 @@ FINDINGS = (
         remedy="use the velocity or positions of GNSS alone",
     ),
     warning(
-        "FILTER_FINDS_NOTHING",
-        "the reference lags by {late:.1f} s, is smoothed over as long, and shows no error of the DVL: a filter may "
-        "have made it from this DVL",
-        remedy="use the velocity or positions of GNSS alone",
-    ),
-    warning(
         "LEVER_ARM_CONTRADICTED",
         "the lever arm in the data differs from the configured one: {axes}",
         means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
@@ -391,12 +385,6 @@ FINDINGS = (
         "in a steady turn a delayed reference or IMU looks like a yaw: {degrees:.1f}° cannot be distinguished; σ "
         "includes it",
         remedy="drive turns to both sides, or a straight leg",
-    ),
-    warning(
-        "REFERENCE_OFFSET",
-        "the reference has a constant error of {millimetres:.0f} mm/s towards {course:.0f}°{where}",
-        means="A constant error of an inertial navigation, or a current in water track. `full` estimates it.",
-        remedy="judge the drift by another reference",
     ),
     warning(
         "ONE_HEADING",

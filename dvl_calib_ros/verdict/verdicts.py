@@ -165,7 +165,7 @@ MANOEUVRES = on_page(
         "WORTH_OF_ANOTHER_MODEL",
         "no longer good enough: the model is {model} now",
         means="`auto` follows the reference; in an outage it uses a model without one.",
-        remedy="Wait for the reference, or name the model.",
+        remedy="Wait for the reference, or set the parameter model.",
     ),
     accept(
         "WORTH_HAS_FALLEN",
@@ -332,7 +332,7 @@ UNPAIRED = on_page(
     marginal("SIMULATOR_FRAME", "its DVL is mounted {simulator}, the vehicle's {vehicle}"),
     accept(
         "SIMULATOR_PUT_RIGHT",
-        "corrected, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
+        "when corrected, its held-out error on the vehicle's motion falls from {before:.1f} to {after:.1f} mm/s",
     ),
     accept(
         "SIMULATOR_ROUNDS",

@@ -257,7 +257,7 @@ def test_another_file_leaves_the_urdf_as_it_is(tmp_path, saved):
         (('<link   name="frame"/>', '<xacro:dvl parent="frame"/>'), "r.urdf:4: holds xacro macros (xacro:dvl)"),
         (("xyz='0 0.2 0.3'", "xyz='0 ${y} 0.3'"), "holds a xacro expression"),
         (("xyz='0 0.2 0.3'", "xyz='0 0.2'"), "is not three numbers"),
-        (('<parent link="frame"/>', '<parent link="dvl_link"/>'), "joint dvl_joint is above itself"),
+        (('<parent link="frame"/>', '<parent link="dvl_link"/>'), "joint dvl_joint is its own ancestor"),
         (('<child link="dvl_link"/>', '<child link="dvl"/>'), "no joint above link 'dvl_link'; name the DVL's joint"),
         (
             ('<parent link="base_link"/>', '<parent link="hull"/>'),

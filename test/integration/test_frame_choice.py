@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from remedies import changes
 from scipy.spatial.transform import Rotation
 from situations import DVL, long_motion, sound
 from stacks import LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
@@ -103,6 +104,24 @@ def test_a_forward_left_up_twist_of_a_vehicle_that_is_z_down_is_turned(tmp_path)
 
 
 @pytest.mark.spread(1)
+def test_a_twist_without_a_pose_leaves_open_whether_the_vehicle_is_z_down(tmp_path):
+    """It was accepted with pitch and yaw of the opposite signs."""
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", frd=True)
+    told.imu("/imu", "base_link", FLU_FROM_FRD, "ned")
+    odometry(told, np.eye(3), pose=False)
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    bag = told.write(tmp_path / "bag")
+    found = replay(bag)
+    assert found.verdict == "marginal" and doctor(bag).verdict == "partly"
+    (open_,) = [each for each in found.discovery.contradictions if each.code == "FRAMES_AMBIGUOUS"]
+    typed = changes(open_.remedy, Parameters.from_mapping(found.replayed.result.parameters))
+    assert typed == {"base_axes": "flu"} and open_.numbers["first"] == "frd"
+    told_axes = replay(bag, base_axes="frd")
+    assert told_axes.verdict == "accept" and is_right(told_axes, truth_deg() * [1.0, -1.0, -1.0])
+
+
+@pytest.mark.spread(1)
 def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(tmp_path):
     told = Told()
     told.dvl("/dvl", TWIST, "dvl_link", frd=True)
@@ -112,7 +131,7 @@ def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(
     as_found = replay(bag)
     assert as_found.verdict == "marginal" and doctor(bag).verdict == "partly"
     assert "dvl_axes frd and dvl_axes flu equally well" in as_found.reasons[0]
-    assert "which side is port on the DVL" in as_found.reasons[0]
+    assert "is the DVL forward-left-up? If so, set dvl_axes to flu; if not, set it to frd" in as_found.reasons[0]
     told_axes = replay(bag, dvl_axes="frd", gnss_frame="body")
     assert "FRAMES_AMBIGUOUS" not in codes(told_axes.discovery.contradictions)
     assert is_right(told_axes, truth_deg())

@@ -167,6 +167,7 @@ FAULTS = {
 # codes whose remedy another module executes
 ELSEWHERE = {
     "DVL_SIDE_INVERTED": "unit/discovery/test_axis_signs.py",
+    "DVL_SIGN_OPEN": "unit/discovery/test_axis_signs.py",
     "GRAVITY_UPSIDE_DOWN": "unit/node/test_gravity_seen.py",
     "BAGS_OVERLAP": "integration/test_several_bags.py",
     "FRAMES_AMBIGUOUS": "integration/test_frame_choice.py",
@@ -176,7 +177,7 @@ ELSEWHERE = {
 # codes whose remedy no test executes: more data, another instrument, a question, or a pointer to a command
 OPEN = {
     "BAGS_DELAY_CHANGED", "BODY_OR_EARTH", "CLOCKS_NOT_TOLD_APART", "DELAY_CHANGED", "DRIFT_OPEN", "DRIFT_WORSE",
-    "DVL_AXIS_SCALED", "DVL_SIGN_OPEN", "GAP_REFERENCE_CONSTANT", "GAP_REFERENCE_VERTICAL", "GAP_TOO_SHORT",
+    "DVL_AXIS_SCALED", "GAP_REFERENCE_CONSTANT", "GAP_REFERENCE_VERTICAL", "GAP_TOO_SHORT",
     "HELD_OUT_SEVERAL_TIMES", "IMU_CONTRADICTS_EITHER", "MOUNTING_SUSPECTED", "MOUNTING_SUSPICIOUS",
     "NOTHING_COMPARED", "SCALE_CHANGED",
 }  # fmt: skip
@@ -219,6 +220,8 @@ def test_a_fault_that_is_named_and_mended_is_not_named_again(code, mended, tmp_p
     found = dc.replay(with_fault(tmp_path / "bag", *FAULTS[code]), history=False)
     assert code in codes_of(found)
     assert found.verdict == ("accept" if "FRAME" in code or "GRAVITY" in code else "reject")
+    if found.verdict == "accept":
+        assert Severity.REJECT not in {each.severity for each in found.discovery.contradictions}
     assert mended.verdict == "accept" and code not in codes_of(mended)
 
 

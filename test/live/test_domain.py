@@ -24,7 +24,7 @@ def test_a_domain_with_a_participant_is_not_free_and_without_a_free_one_the_demo
     with pytest.raises(InputError, match="every ROS domain"):
         demo.take_domain()
     assert "every ROS domain from" in fail(capsys, "demo")
-    assert demo._take(world.domain)
+    assert demo._claim_domain(world.domain)
     world.close()
     assert demo.take_domain() == world.domain
     demo.give_back(world.domain)

@@ -23,23 +23,23 @@ from stress_ending import stress
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.node.main import parameter_files
-from dvl_calib_ros.node.shutdown import ENDING, Ending
+from dvl_calib_ros.node.shutdown import END_SIGNALS, Ending
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 
 # ---------------------------------------------------------------- the flag
 
 
-@pytest.mark.parametrize("number", ENDING)
+@pytest.mark.parametrize("number", END_SIGNALS)
 def test_a_signal_becomes_a_flag_wakes_who_waits_and_raises_nothing(number):
     before = signal.getsignal(number)
     told = threading.Event()
     with Ending() as ending:
         assert not ending.requested
-        ending.tell(told.set)
+        ending.call_on_request(told.set)
         os.kill(os.getpid(), number)
         assert told.wait(10.0) and ending.requested
         late = threading.Event()
-        ending.tell(late.set)
+        ending.call_on_request(late.set)
         assert late.is_set()
     assert signal.getsignal(number) is signal.SIG_IGN  # what comes while the process ends
     signal.signal(number, before)
@@ -71,14 +71,14 @@ def test_a_signal_that_comes_while_another_is_taken_does_not_wait_for_it():
 
 def test_who_is_told_is_told_again_until_it_has_heard(monkeypatch):
     """A wake-up that the middleware loses must not leave a node that waits for ever."""
-    monkeypatch.setattr("dvl_calib_ros.node.shutdown.AGAIN_S", 0.2)
+    monkeypatch.setattr("dvl_calib_ros.node.shutdown.REPEATED_EVERY_S", 0.2)
     before = signal.getsignal(signal.SIGINT)
     told = threading.Semaphore(0)
     with Ending() as ending:
-        ending.tell(told.release)
+        ending.call_on_request(told.release)
         os.kill(os.getpid(), signal.SIGINT)
         assert all(told.acquire(timeout=10.0) for _ in range(3))
-        ending.heard()
+        ending.stop_calling()
         time.sleep(0.1)  # a call that is under way
         while told.acquire(blocking=False):
             pass
@@ -87,23 +87,23 @@ def test_who_is_told_is_told_again_until_it_has_heard(monkeypatch):
 
 
 def test_without_a_signal_everything_is_afterwards_as_it_was():
-    before = [signal.getsignal(number) for number in ENDING]
+    before = [signal.getsignal(number) for number in END_SIGNALS]
     threads = threading.active_count()
     with Ending() as ending:
         assert signal.getsignal(signal.SIGINT) not in before
     assert not ending.requested
-    assert [signal.getsignal(number) for number in ENDING] == before and threading.active_count() == threads
+    assert [signal.getsignal(number) for number in END_SIGNALS] == before and threading.active_count() == threads
 
 
 def test_a_pipe_that_is_closed_is_a_request():
     reading, writing = os.pipe()
     told = threading.Event()
     with Ending(closed=reading) as ending:
-        ending.tell(told.set)
+        ending.call_on_request(told.set)
         os.close(writing)
         assert told.wait(10.0)
     os.close(reading)
-    for number in ENDING:
+    for number in END_SIGNALS:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 

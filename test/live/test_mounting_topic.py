@@ -130,9 +130,9 @@ def test_with_publish_tf_the_transform_is_that_pose_and_another_of_the_same_fram
         assert (move.x, move.y, move.z) == (pose.position.x, pose.position.y, pose.position.z)
         until(lambda: diagnostics, "diagnostics")
         assert "TF_TWICE" not in diagnostics[-1].status[0].message
-        heard = node._transforms.heard
+        heard = node._transforms.n_messages
         node._transforms._on_transforms(SimpleNamespace(transforms=[transform]))  # it comes back to its sender
-        assert node._transforms.heard == heard
+        assert node._transforms.n_messages == heard
         other = TransformStamped()
         other.child_frame_id = "dvl_a50"
         node._transforms._on_transforms(SimpleNamespace(transforms=[other]))

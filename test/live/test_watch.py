@@ -127,8 +127,8 @@ class Asked:
 def test_keys_save_and_leave_and_forget_only_when_pressed_twice():
     listener = Asked()
     keys = Keys(listener)
-    assert keys.press("s", 0.0) and listener.calls == ["save"] and keys.said == "saved to x.yaml"
-    assert keys.press("r", 1.0) and listener.calls == ["save"] and "again" in keys.said
+    assert keys.press("s", 0.0) and listener.calls == ["save"] and keys.last_answer == "saved to x.yaml"
+    assert keys.press("r", 1.0) and listener.calls == ["save"] and "again" in keys.last_answer
     assert keys.press("r", 1.0 + SURE_S) and listener.calls == ["save"]
     assert keys.press("r", 2.0 + SURE_S) and listener.calls == ["save", "reset"]
     keys.press("r", 9.0), keys.press("s", 9.1), keys.press("r", 9.2)
@@ -151,7 +151,9 @@ def test_q_asks_before_a_worse_result_replaces_a_better_one():
         listener.answer, listener.is_waiting = answer, False
         assert keys.has_left() == (not key)
         if key:
-            assert keys.said.startswith("replace the better result? (y/n)  x.yaml is kept") and not keys.has_left()
+            assert (
+                keys.last_answer.startswith("replace the better result? (y/n)  x.yaml is kept") and not keys.has_left()
+            )
             assert keys.press("x", 2.0), "another key answers nothing"
             went_on = keys.press(key, 3.0)
             listener.answer = "saved to x.yaml"

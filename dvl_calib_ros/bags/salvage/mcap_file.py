@@ -249,7 +249,7 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     damage, summary = Damage(), None
     with suppress(DamagedError):  # the summary repeats schemas and channels, whose own chunk may be damaged
         summary = _summary(file)
-    repeated = Tables(summary) if summary else _unreferenced_tables(file, size).unmet()
+    repeated = Tables(summary) if summary else _unreferenced_tables(file, size).mark_replaceable()
     announced = Counter(summary.statistics.channel_message_counts if summary and summary.statistics else {})
     file.seek(0)
     is_cut = file.read(len(MCAP_MAGIC)) != MCAP_MAGIC and not holes_in(file, 0, len(MCAP_MAGIC))
@@ -326,7 +326,7 @@ class _FileWalk:
         try:
             self.held, end, before = self._record(at)
         except DamagedError as error:
-            place, is_before_damaged = self._resumed(at)
+            place, is_before_damaged = self._resume_after(at)
             if is_before_damaged and self._before is not None:
                 found, at = [], self._before
             self._damage.note(str(error), place - at)
@@ -398,19 +398,19 @@ class _FileWalk:
     def _next_place(self, at: int) -> int:
         """Return where to continue after the damaged chunk at `at`: at its end if records follow there, else search."""
         end = sound_end(self._file, at, self._size, self._tables)
-        return self._resumed(at).place if end is None else end
+        return self._resume_after(at).place if end is None else end
 
-    def _resumed(self, at: int) -> Resumed:
+    def _resume_after(self, at: int) -> Resumed:
         """Return where to continue after the damaged record at `at`."""
         if self._before is None and not head_at(self._file, at).startswith(bytes([MESSAGE])):
             end = sound_end(self._file, at, self._size, self._tables)
             if end is not None:
                 return Resumed(end, False)
-        found = self._searched(at)
+        found = self._search_after(at)
         headless = (start for start in self._indexes if at < start < found.place and self._index_instead_of_head(start))
         return found._replace(place=min(headless, default=found.place))
 
-    def _searched(self, at: int) -> Resumed:
+    def _search_after(self, at: int) -> Resumed:
         """Search where to continue after damage: at a chunk, or without chunks at a record."""
         if self._may_hold_chunks:
             start = at if self._before is None else self._before

@@ -81,8 +81,8 @@ class Tables:
         self._met = {(SCHEMA, each) for each in self.schemas} | {(CHANNEL, each) for each in self.channels}
         self._made: dict[int, tuple[str, str, str, str]] = {}
         if summary and summary.statistics and summary.statistics.message_count:
-            self.meet(summary.statistics.message_start_time)
-            self.meet(summary.statistics.message_end_time)
+            self.note_era(summary.statistics.message_start_time)
+            self.note_era(summary.statistics.message_end_time)
 
     def copy(self) -> Tables:
         """Return a copy."""
@@ -91,12 +91,12 @@ class Tables:
         copied.eras, copied._met = set(self.eras), set(self._met)
         return copied
 
-    def unmet(self) -> Tables:
+    def mark_replaceable(self) -> Tables:
         """Mark a summary's tables as replaceable, because it may belong to another recording. Return self."""
         self._met.clear()
         return self
 
-    def meet(self, log_ns: int) -> None:
+    def note_era(self, log_ns: int) -> None:
         """Note the era of a log time."""
         era = log_ns >> ERA_BITS
         if era not in self.eras:
@@ -120,10 +120,11 @@ class Tables:
         """Return a message with its channel's topic, type and definition."""
         log_ns, channel_id, data = message
         if channel_id not in self._made:
-            self._made[channel_id] = self._of(self.channels[channel_id])
+            self._made[channel_id] = self._type_of(self.channels[channel_id])
         return Salvaged(*self._made[channel_id], log_ns, data)
 
-    def _of(self, channel: Channel) -> tuple[str, str, str, str]:
+    def _type_of(self, channel: Channel) -> tuple[str, str, str, str]:
+        """Return topic, type, encoding and definition of a channel, empty where the schema is missing."""
         known = self.schemas.get(channel.schema_id)
         if known is None:
             return channel.topic, "", "", ""
@@ -265,9 +266,9 @@ def _record_follows(file: BinaryIO, at: int, size: int, tables: Tables, deep: in
 
 
 def message_head(
-    head: bytes, at: int, here: int, n: int, tables: Tables, holds: Callable[[int], bytes]
+    head: bytes, at: int, offset: int, n: int, tables: Tables, holds: Callable[[int], bytes]
 ) -> tuple[int, int]:
-    """Return channel and log time of a message record at `here` of `n`. Raises DamagedError if invalid.
+    """Return channel and log time of a message record at `offset` of `n`. Raises DamagedError if invalid.
 
     at: position of all records in the file. holds: function that returns the bytes at a position.
     """
@@ -277,14 +278,14 @@ def message_head(
     channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(head, RECORD_HEAD.size)
     if length < _MESSAGE_HEAD.size or channel not in tables.channels:
         raise DamagedError(f"at byte {at}: a message is of no known channel")
-    usual = tables.lengths.get(channel, length)
-    if usual != length and tables.eras:  # a damaged length may lead into the message or past others
-        ends = [here + RECORD_HEAD.size + each for each in (usual, length)]
+    expected = tables.lengths.get(channel, length)
+    if expected != length and tables.eras:  # a damaged length may lead into the message or past others
+        ends = [offset + RECORD_HEAD.size + each for each in (expected, length)]
         by_usual, by_own = (likeness(holds(end), n - end, tables) for end in ends)
-        if by_usual == ALIKE and (usual < length or by_own < ENOUGH_ALIKE):
+        if by_usual == ALIKE and (expected < length or by_own < ENOUGH_ALIKE):
             raise DamagedError(f"at byte {at}: the length of a message is damaged")
     tables.lengths[channel] = length
-    tables.meet(log_ns)
+    tables.note_era(log_ns)
     return channel, log_ns
 
 
@@ -466,7 +467,7 @@ def chunk_head(file: BinaryIO, at: int) -> ChunkHead:
 
 
 def is_chunk(file: BinaryIO, at: int, length: int) -> bool:
-    """Return whether a record looks like a chunk, apart from its opcode."""
+    """Return whether a record with a damaged opcode looks like a chunk."""
     with suppress(DamagedError):
         head = chunk_head(file, at)
         return head.size + head.packed_size == length and 0 < head.unpacked_size <= LARGEST_RECORD

@@ -152,6 +152,7 @@ class _Pages:
         return page
 
     def _row(self, page: bytes, at: int) -> _TableRow:
+        """Return the row of a table's leaf page at an offset. Raises ValueError."""
         size, at = _varint(page, at)
         number, at = _varint(page, at)
         if size > min(LARGEST_RECORD, self.count * self.size):
@@ -160,12 +161,12 @@ class _Pages:
 
     def _payload(self, page: bytes, at: int, size: int) -> bytes:
         """Return the content of a row, with its overflow pages (section 1.6 of https://sqlite.org/fileformat2.html)."""
-        largest, least = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
+        largest, smallest = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
         if size <= largest:
             local = size
         else:
-            local = least + (size - least) % (self._usable - 4)
-            local = least if local > largest else local
+            local = smallest + (size - smallest) % (self._usable - 4)
+            local = smallest if local > largest else local
         if at + local > min(self._usable, len(page)):
             raise ValueError("cut off by the end of its page")
         content = bytearray(page[at : at + local])

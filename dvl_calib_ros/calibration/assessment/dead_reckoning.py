@@ -18,14 +18,12 @@ from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..checks.beam_faults import BeamFault
 from ..checks.data_warnings import one_heading_warnings
-from ..checks.heading_deviation import HeadingDeviation, heading_deviation, heading_warnings, severity_of
+from ..checks.heading_deviation import HeadingDeviation, heading_deviation, heading_warning
 from ..checks.lever_arm_check import lever_arm_warnings
 from ..checks.residual_tests import (
     ResidualTrend,
     confused_with_bias_std,
-    is_insignificant,
     moving_bed,
-    reference_lag_s,
     residual_trend,
     residual_warnings,
 )
@@ -38,6 +36,7 @@ from ..numerics.samples import Index
 from ..results.held_out_verification import ACCEPTED_DRIFT
 from ..results.results import Estimate
 from ..results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
+from ..streams.interpolation import GAP_S
 from ..streams.position_velocities import are_positions
 
 # Stretch lengths for the drift, m: the longest with ENOUGH stretches, else the whole track.
@@ -45,12 +44,10 @@ STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
 ENOUGH = 3
 # Shortest track, m.
 SHORTEST_M = 20.0
-# Longest interval that is integrated: the larger of this multiple of the usual interval and this time, s.
-GAP_INTERVALS, GAP_S = 5.0, 2.0
+# Longest interval that is integrated, in usual ones; at least `GAP_S`.
+GAP_INTERVALS = 5.0
 # Ratio of drift with and without calibration that few stretches rarely exceed by noise.
 WORSE = 1.5
-# Ratio of median squared velocity errors below which velocities fit significantly better.
-FITS_BETTER = 0.5
 # Samples compared together, which limits memory.
 COMPARED_AT_ONCE = 2048
 # Points of a track that are kept for a map.
@@ -144,14 +141,6 @@ class Navigation:
         """Mean speed, m/s."""
         return self.distance_m / max(self.seconds, 1e-9)
 
-    @property
-    def fits_better(self) -> bool:
-        """Return whether median velocity errors are significantly smaller; on a returning track their drift cancels."""
-        if not len(self.error_before):
-            return False
-        before, after = (median((each**2).sum(axis=1)) for each in (self.error_before, self.error_after))
-        return bool(after < FITS_BETTER * before)
-
 
 def dead_reckoned(
     recording: ThinnedRecording,
@@ -181,27 +170,27 @@ def dead_reckoned(
     step_s = integration_steps(recording.dvl.times[use])
     axes = slice(2, 4) if on_a_map else slice(0, 2)
     velocity = before.velocity[use, axes]
-    along = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
-    if not len(along) or along[-1] < SHORTEST_M:
+    distance = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
+    if not len(distance) or distance[-1] < SHORTEST_M:
         return None
     errors = [each.error[use, axes] for each in (before, after)]
     astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
     if slow is not None and recording.reference.in_body.all():
         slow = slow._replace(heading=0.0)  # body velocities need no heading
-    ends = ends_of_stretches(along)
+    ends = ends_of_stretches(distance)
     kept = np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
-        distance_m=float(along[-1]),
+        distance_m=float(distance[-1]),
         seconds=float(step_s.sum()),
-        stretch_m=float(along[-1] if len(ends) == 2 else along[ends[1]] - along[ends[0]]),
+        stretch_m=float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]]),
         stretches=len(ends) - 1,
-        before=drift_over(astray[0], along, ends),
-        after=drift_over(astray[1], along, ends),
-        noise_per_km=_noise(errors[1], step_s, along, ends, slow),
+        before=drift_over(astray[0], distance, ends),
+        after=drift_over(astray[1], distance, ends),
+        noise_per_km=_noise(errors[1], step_s, distance, ends, slow),
         on_a_map=on_a_map,
         stamps_ns=np.round(recording.dvl.times[use[kept]] * 1e9).astype(np.int64) + epoch_ns,
-        distances=along[kept],
+        distances=distance[kept],
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],
@@ -270,37 +259,37 @@ def integration_steps(times: Array) -> Array:
     return np.where(interval > max(GAP_S, GAP_INTERVALS * usual), 0.0, np.maximum(interval, 0.0))
 
 
-def ends_of_stretches(along: Array) -> Index:
+def ends_of_stretches(distance: Array) -> Index:
     """Return indices (S + 1,) of the limits of stretches, for the longest length with enough stretches."""
     for length in STRETCHES_M:
-        n = int(along[-1] // length)
+        n = int(distance[-1] // length)
         if n >= ENOUGH:
-            return np.asarray(np.searchsorted(along, length * np.arange(n + 1)).clip(0, len(along) - 1))
-    return np.array([0, len(along) - 1])
+            return np.asarray(np.searchsorted(distance, length * np.arange(n + 1)).clip(0, len(distance) - 1))
+    return np.array([0, len(distance) - 1])
 
 
-def drift_over(astray: Array, along: Array, ends: Index) -> Drift:
+def drift_over(error_of_track: Array, distance: Array, ends: Index) -> Drift:
     """Return the drift from track errors (N, 2) m at distances (N,) m, over the stretches between ends (S + 1,)."""
-    off = np.linalg.norm(np.diff(astray[ends], axis=0), axis=1)
-    share = off / np.maximum(np.diff(along[ends]), 1e-9)
-    return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(astray[-1])))
+    error_m = np.linalg.norm(np.diff(error_of_track[ends], axis=0), axis=1)
+    share = error_m / np.maximum(np.diff(distance[ends]), 1e-9)
+    return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(error_of_track[-1])))
 
 
-def _noise(errors: Array, step_s: Array, along: Array, ends: Index, slow: SlowNoise | None) -> float:
+def _noise(errors: Array, step_s: Array, distance: Array, ends: Index, slow: SlowNoise | None) -> float:
     """Return the drift by white and slow noise, m per km, rms over stretches.
 
-    errors: (K, 2) m/s; differences of neighbours give the white noise. step_s: (K,) s. along: (K,) m driven.
+    errors: (K, 2) m/s; differences of neighbours give the white noise. step_s: (K,) s. distance: (K,) m driven.
     ends: (S + 1,) indices of the ends of stretches.
     """
     if len(errors) < 3:
         return 0.0
     variance = median(np.diff(errors, axis=0) ** 2).sum() / (2.0 * MEDIAN_SQUARE)
     squares = np.concatenate([[0.0], np.cumsum(step_s[1:] ** 2)])
-    metres = np.maximum(np.diff(along[ends]), 1e-9)
-    off = variance * np.diff(squares[ends])
+    metres = np.maximum(np.diff(distance[ends]), 1e-9)
+    variances = variance * np.diff(squares[ends])
     if slow is not None:
-        off = off + slow.squares(np.diff(np.cumsum(step_s)[ends]), metres)
-    share = off / metres**2
+        variances = variances + slow.squares(np.diff(np.cumsum(step_s)[ends]), metres)
+    share = variances / metres**2
     return 1000.0 * math.sqrt(float(np.mean(share)))
 
 
@@ -333,7 +322,7 @@ def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Rea
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]
     worse = finding("DRIFT_WORSE", after=after, before=before)
     is_open = after**2 - before**2 < (2.0 * known_to) ** 2
-    return [worse.weighed(Severity.MARGINAL) if navigation.fits_better or is_open else worse]
+    return [worse.weighed(Severity.MARGINAL) if is_open else worse]
 
 
 def in_words(navigation: Navigation) -> list[str]:
@@ -375,7 +364,7 @@ def doubts(
     finders: Estimates of the lever arm, the best first.
     navigation: Held-out drift with the selected model; None if not available.
     parameters: The configuration.
-    suggested: Whether another configuration fits, which would explain a different lever arm.
+    suggested: Whether another configuration fits, which would explain a different lever arm and a beam.
     in_earth: Whether the reference is in an earth frame.
     is_level: Whether the IMU gives a heading only, see `IMU_LEVEL`.
     """
@@ -388,17 +377,14 @@ def doubts(
     if bed is not None:  # a moving bed looks like a heading error, and like a reference error
         found.append(bed)
     elif navigation.deviation is not None:
-        found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))
+        found.append(heading_warning(navigation.deviation))
     if in_earth and bed is None:
         found += one_heading_warnings(estimate, parameters, navigation.speed)
-    # the first-order model of a misalignment makes a velocity longer, which looks like one beam
-    is_large = float(np.linalg.norm(estimate.state[:3])) > parameters.reject_misalignment
     return found + residual_warnings(
         navigation.followed,
         are_positions(parameters),
-        reference_lag_s(estimate, parameters),
-        is_insignificant(estimate),
         confused_with_bias_std(estimate, parameters),
-        None if is_large else navigation.beam,
+        None if suggested else navigation.beam,
         ACCEPTED_DRIFT * parameters.target_drift / KM,
+        float(estimate.state[:3] @ estimate.state[:3]),
     )

@@ -102,8 +102,8 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
     information = np.linalg.pinv(estimate.velocity_covariance)
     chosen, seconds = None, 0.0
     for _ in range(MOST):
-        left = np.linalg.inv(information + gains)
-        drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, left, rows))
+        posterior = np.linalg.inv(information + gains)
+        drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, posterior, rows))
         best = int(np.argmin(drifts))
         if chosen is None:
             chosen = tried[best][0]
@@ -126,8 +126,8 @@ def _name(reason: Reason) -> object:
 def _until(information: Array, gain: Array, rows: Array, target: float) -> float:
     """Return the duration, s, of a manoeuvre after which the drift is within its target."""
     shares = np.linspace(0.0, 1.0, 13)[1:]
-    left = np.linalg.inv(information + shares[:, None, None] * gain)
-    drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, left, rows))
+    posterior = np.linalg.inv(information + shares[:, None, None] * gain)
+    drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, posterior, rows))
     return TRIED_S * float(shares[int(np.argmax(drifts <= target))])
 
 

@@ -98,8 +98,8 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     share, std, number = max(found, key=lambda each: abs(each[0]) / each[1], default=(0.0, 1.0, N_EFFECTS - 1))
     if number == N_EFFECTS - 1:
         return None
-    off = abs(share) * float(np.linalg.norm(BEAMS[number - 1] @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
-    return BeamFault(abs(share), std, (AZIMUTHS_DEG[number - 1] + 180.0 * (share < 0.0)) % 360.0, off)
+    relative = abs(share) * float(np.linalg.norm(BEAMS[number - 1] @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
+    return BeamFault(abs(share), std, (AZIMUTHS_DEG[number - 1] + 180.0 * (share < 0.0)) % 360.0, relative)
 
 
 def beam_warning(found: BeamFault | None, accepted: float) -> list[Reason]:

@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
-from ..numerics.tests import Z_REPEATED_TEST
-from ..results.mounting_quantities import date
-from ..results.results import ARM, OFFSETS, Day, Estimate
+from ..numerics.robust import FEWEST_SAMPLES
+from ..results.results import ARM, OFFSETS, TAPE_STD_M, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
-# Samples needed for a warning.
-ENOUGH_SAMPLES = 20
 # Share of exactly repeated DVL velocities above which the driver repeats stale data. Share of samples without attitude
 # or turn rate, such as those before the IMU's first, that changes no answer.
 SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0
-# Constant reference error that is reported, m/s.
-OFFSET_REPORTED_FROM_MPS = 0.01
 # Share of the reference error that yaw absorbs, above which the two are not separable.
 NOT_SHOWN = 0.6
-# Uncertainty due to a clock offset that is reported: lever arm (m), delay (s), yaw (°).
-REPORTED_FROM_M, REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.05, 0.1
+# Uncertainty due to a clock offset that is reported: delay (s), yaw (°); a lever arm from `TAPE_STD_M`.
+REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.1
 # GNSS losses from which reception is unstable.
 FLAPPING = 3
 
@@ -56,7 +51,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     """Return warnings on the data received, from `Calibrator.counts`."""
     dvl, pairing = counts["dvl"], counts["pairing"]
     found = []
-    if dvl["received"] >= ENOUGH_SAMPLES and not dvl["accepted"]:
+    if dvl["received"] >= FEWEST_SAMPLES and not dvl["accepted"]:
         lost = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
         found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=lost))
     if _never_meet(counts):
@@ -67,7 +62,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
         found.append(finding("DVL_DROPOUTS", count=dvl["dropouts"]))
     if dvl["frozen"]:
         found.append(finding("DVL_FROZEN", count=dvl["frozen"]))
-    elif dvl["repeated"] >= ENOUGH_SAMPLES and dvl["repeated"] > SUSPICIOUS_REPEATED * dvl["usable"]:
+    elif dvl["repeated"] >= FEWEST_SAMPLES and dvl["repeated"] > SUSPICIOUS_REPEATED * dvl["usable"]:
         found.append(finding("DVL_REPEATS", count=dvl["repeated"]))
     if pairing["gnss_losses"] >= FLAPPING:
         found.append(finding("GNSS_LOSSES", count=pairing["gnss_losses"]))
@@ -89,20 +84,20 @@ def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
     usable = 2 * reference["received"] - sum(reference.values())
     if pairing["paired"] or pairing["without_attitude"]:
         return False
-    return usable >= ENOUGH_SAMPLES and pairing["unpaired"] >= ENOUGH_SAMPLES
+    return usable >= FEWEST_SAMPLES and pairing["unpaired"] >= FEWEST_SAMPLES
 
 
 def gate_warnings(estimate: Estimate) -> list[Reason]:
     """Return a warning if a model's gate rejects so many samples that the configuration must be wrong."""
     given = estimate.used + estimate.gated
-    if given < ENOUGH_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
+    if given < FEWEST_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
         return []
     return [finding("SAMPLES_GATED", model=estimate.model, gated=estimate.gated, given=given)]
 
 
 def consistency_warnings(estimate: Estimate) -> list[Reason]:
     """Return a warning if a model's innovations exceed their predicted covariance; smaller ones only enlarge σ."""
-    if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
+    if estimate.used < FEWEST_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
     return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
 
@@ -122,13 +117,9 @@ def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: floa
     return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
 
 
-def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reason]:
-    """Return warnings on a clock offset that leaves lever arm or yaw uncertain, and on constant reference errors.
-
-    days: per-day values of the model, if there are several days.
-    """
-    std = estimate.std_of(*OFFSETS)
-    if std is None:
+def reference_warnings(estimate: Estimate) -> list[Reason]:
+    """Return warnings on a clock offset that leaves lever arm or yaw uncertain."""
+    if estimate.std_of(*OFFSETS) is None:
         return []
     reasons = []
     open_std = np.sqrt(np.diag(estimate.left_open))
@@ -137,18 +128,8 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
-        if metres >= REPORTED_FROM_M or seconds >= REPORTED_FROM_S:
+        if metres >= TAPE_STD_M or seconds >= REPORTED_FROM_S:
             reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
         elif turn >= REPORTED_FROM_DEG:  # the lever arm is configured
             reasons.append(finding("CLOCK_ON_TURN", degrees=turn))
-    found = [
-        (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
-        for day in days
-    ] or [("", np.array([estimate.state_of(name) for name in OFFSETS]), std)]
-    for where, offset, own_std in found:
-        size = float(np.linalg.norm(offset))
-        if size < OFFSET_REPORTED_FROM_MPS or (np.abs(offset) < Z_REPEATED_TEST * own_std).all():
-            continue
-        course = math.degrees(math.atan2(*offset)) % 360.0
-        reasons.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
     return reasons

@@ -12,18 +12,16 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
-from ..numerics.robust import median, steps
+from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, median, steps
 
-# Samples per block, and blocks needed.
-FEWEST, ENOUGH = 12, 6
+# Blocks needed.
+ENOUGH = 6
 # Two streams share a topic if squared changes over one sample exceed FURTHER times those over two, plus FURTHER_MPS2,
 # (m/s)², for motion. MOST: share of the blocks in which they must.
 FURTHER, FURTHER_MPS2, MOST = 6.0, 0.02**2, 0.6
 # Rounding step, as a share of the speed, that changes the mounting by half a degree. Share of repeated values that
 # shows it: noise does not average it out.
 ROUNDED_FROM, REPEATED_FROM = 0.03, 0.4
-# Noise (m/s) of another axis from which an axis of zeros is dead.
-NOISE_MPS = 1e-3
 _AXES = "xyz"
 
 
@@ -39,7 +37,7 @@ class DvlStream:
 
     def add(self, velocity: Array) -> None:
         """Add a block of consecutive DVL velocities (N, 3) m/s."""
-        if len(velocity) < FEWEST:
+        if len(velocity) < FEWEST_VALUES:
             return
         one, two = steps(velocity), velocity[2:] - velocity[:-2]
         near, far = (float(median((each**2).sum(axis=1))) for each in (two, one))
@@ -64,6 +62,6 @@ class DvlStream:
         if step > ROUNDED_FROM * math.sqrt(self._square / self._n):
             return finding("DVL_ROUNDED", step=step)
         dead = [axis for axis, is_dead in zip(_AXES, self._is_dead, strict=True) if is_dead]
-        if dead and len(dead) < 3 and self._noise > NOISE_MPS:
+        if dead and len(dead) < 3 and self._noise > QUIETEST_MPS:
             return finding("DVL_AXIS_DEAD", axes=" and ".join(dead))
         return None

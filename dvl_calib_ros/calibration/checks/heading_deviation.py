@@ -16,15 +16,11 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.tests import Z_ONE_TEST, chance_of, chi2_isf
-from ..results.results import Estimate
 
 # Reported from this rms (rad).
 REPORTED_FROM_RAD = math.radians(0.3)
 # Rms (rad) from which the compass must be calibrated first (QRev's rule).
 FIRST = math.radians(3.0)
-# The same from GATED_FIRST (rad) if more than this share of samples is gated: the deviation affects these most, so it
-# may be larger.
-GATED_FIRST, GATED_FROM = math.radians(1.0), 0.1
 
 
 class HeadingDeviation(NamedTuple):
@@ -54,32 +50,25 @@ def heading_deviation(yaw: Array, coefficients: GaussianState) -> HeadingDeviati
         return None
     terms = np.stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)], axis=1)
     terms -= terms.mean(axis=0)
-    shown = terms @ coefficients.x
-    rms = float(np.sqrt((shown**2).mean()))
+    deviation = terms @ coefficients.x
+    rms = float(np.sqrt((deviation**2).mean()))
     std = math.sqrt(max(float(np.einsum("ni,ij,nj->n", terms, coefficients.p, terms).mean()), 0.0))
     found = float(coefficients.x @ np.linalg.solve(coefficients.p, coefficients.x))
     if rms < REPORTED_FROM_RAD or found < chi2_isf(chance_of(Z_ONE_TEST), len(coefficients.x)):
         return None
-    most, least = int(np.argmax(shown)), int(np.argmin(shown))
+    most, least = int(np.argmax(deviation)), int(np.argmin(deviation))
     north = (0.5 * math.pi - yaw) % (2.0 * math.pi)
     return HeadingDeviation(
-        rms, std, float(shown[most]), float(north[most]), float(shown[least]), float(north[least])
+        rms, std, float(deviation[most]), float(north[most]), float(deviation[least]), float(north[least])
     )  # fmt: skip
 
 
-def severity_of(found: HeadingDeviation, estimate: Estimate) -> Severity:
-    """Return the effect on the verdict: reject if the compass must be calibrated before the mounting."""
-    is_cut = estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
-    if (is_cut and found.rms > GATED_FIRST) or found.rms > max(FIRST, Z_ONE_TEST * found.std):
-        return Severity.REJECT
-    return Severity.MARGINAL if is_cut else Severity.WARNING
-
-
-def heading_warnings(found: HeadingDeviation) -> Reason:
-    """Word the deviation as a warning."""
+def heading_warning(found: HeadingDeviation) -> Reason:
+    """Return the warning; it rejects a calibration if the compass must be calibrated before the mounting."""
     degrees = math.degrees
-    first = "calibrate the compass first: " if found.rms > max(FIRST, Z_ONE_TEST * found.std) else ""
-    return finding(
+    is_first = found.rms > max(FIRST, Z_ONE_TEST * found.std)
+    first = "calibrate the compass first: " if is_first else ""
+    said = finding(
         "HEADING_DEVIATION",
         rms=degrees(found.rms),
         std=degrees(found.std),
@@ -90,3 +79,4 @@ def heading_warnings(found: HeadingDeviation) -> Reason:
         cost=1000.0 * found.rms,
         first=first,
     )
+    return said.weighed(Severity.REJECT if is_first else Severity.WARNING)

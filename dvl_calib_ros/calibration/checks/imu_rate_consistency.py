@@ -17,18 +17,17 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
+from ..numerics.robust import FEWEST_OF_MOTION
 from ..numerics.samples import Index
 from ..streams.imu_frame import quaternion_product
 
 # Interval of differentiation, s: 0.05° of attitude noise become 0.1 °/s. Longer gaps are skipped.
 SPAN_S, LONGEST_S = 0.5, 1.6
-# Largest turn rate of a vehicle with a DVL, rad/s; larger differences are outliers of the attitude.
-FASTEST = 1.5
-# Differences, and turn rate (rms, rad/s), needed for the test.
-ENOUGH, LEAST_TURNING = 60, 0.005
-# Residual share of the squared turn rate: at most with another convention, at most relative to the given one, and at
-# least with the given one for a contradiction.
-LEFT_AT_MOST, BETTER_BY, WRONG_FROM = 0.25, 0.25, 0.02
+# Turn rate (rms, rad/s) needed for the test.
+LEAST_TURNING = 0.005
+# Residual share of the squared turn rate: at most with another convention, also relative to the given one, and at least
+# with the given one for a contradiction.
+LEFT_AT_MOST, WRONG_FROM = 0.25, 0.02
 # Conventions within this factor of the best are reported too. Smallest rotation (°) and scale (log) that count as such.
 AS_GOOD, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
 # A rotation with row elements this near 1 only exchanges axes, which is tested separately.
@@ -96,7 +95,7 @@ class AttitudeRates:
         steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         w = (sums[last] - sums[first]) / seconds[:, None]
-        good = (seconds <= LONGEST_S) & ((a**2).sum(axis=1) < FASTEST**2)
+        good = seconds <= LONGEST_S
         a, w, before, after = a[good], w[good], before[good], after[good]
         middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
@@ -111,33 +110,33 @@ class AttitudeRates:
     @property
     def is_level(self) -> bool:
         """Return whether the attitude is a heading only, without roll and pitch."""
-        return self._n >= ENOUGH and not self._tilted
+        return self._n >= FEWEST_OF_MOTION and not self._tilted
 
     def contradiction(self) -> Reason | None:
         """Return the reason, and the convention that fits, if attitude and angular velocity disagree."""
         shown = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
         total = float(np.trace(self._turning[shown, shown]))
-        if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
+        if self._n < FEWEST_OF_MOTION or total < self._n * LEAST_TURNING**2:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")
-        given = self._left(_BODY, np.eye(3), shown)
+        given = self._misfit(_BODY, np.eye(3), shown)
         if given < WRONG_FROM * total:
             return None
-        explained = [(self._left(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
+        explained = [(self._misfit(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
         best = min(left for left, _ in explained)
-        if best > min(LEFT_AT_MOST * total, BETTER_BY * given):
+        if best > LEFT_AT_MOST * min(total, given):
             return None
         found, *others = (fits for left, fits in explained if left <= AS_GOOD * best + 1e-3 * total)
         if others:
             return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
         return finding("IMU_CONTRADICTS", found=found)
 
-    def _left(self, frame: int, matrix: Array, shown: slice) -> float:
+    def _misfit(self, frame: int, matrix: Array, observable: slice) -> float:
         """Return Σ|a - B w|² over the observable axes, for B (3, 3) and a frame of w."""
-        matrix = matrix[shown]
-        crossed = float((matrix * self._both[frame][shown]).sum())
-        turning = float(np.trace(self._turning[shown, shown]))
+        matrix = matrix[observable]
+        crossed = float((matrix * self._both[frame][observable]).sum())
+        turning = float(np.trace(self._turning[observable, observable]))
         return turning - 2.0 * crossed + float(np.trace(matrix @ self._rates[frame] @ matrix.T))
 
     def _explanations(self) -> Iterator[tuple[int, Array, Reason]]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
-from ..numerics.robust import median
+from ..numerics.robust import FEWEST_VALUES, ROUNDING_MPS, median
 from ..numerics.samples import Mask
 from ..numerics.tests import Z_FIFTY_TESTS, Z_ONE_TEST, chance_of, chi2_isf
 
@@ -31,10 +31,8 @@ SHIFTS_S: Array = 0.1 * np.arange(-2, 11)
 Z_BEST_SHIFT = math.sqrt(chi2_isf(chance_of(Z_FIFTY_TESTS) / len(SHIFTS_S), 1.0))
 # Tolerances as shares of the interval: of the intervals in a difference, and of the time between the streams' samples.
 EVEN, NEAR = 0.25, 0.6
-# Noise below this, m/s, is rounding.
-LEAST_NOISE_MPS = 1e-4
-# Stretches needed, differences per stretch (three axes), and samples per stretch of a slow reference.
-ENOUGH, FEWEST, FEWEST_SLOW = 12, 30, 12
+# Differences needed per stretch (three axes); of a slow reference, samples.
+FEWEST = 30
 # Share of the noise that is reported. A filter that smooths passes little noise on.
 SHARED_FROM = 0.06
 # Smallest share of noise in the differences; with less they are motion.
@@ -93,7 +91,7 @@ class SharedNoise:
         c_4, v_4, v_2 = np.stack([dvl_4 * other_4, dvl_4 * dvl_4, dvl_2 * dvl_2]).sum(axis=(2, 3)) / np.maximum(
             count, 1
         )
-        enough = count >= (FEWEST if reference_step <= SLOWEST_S else FEWEST_SLOW)
+        enough = count >= (FEWEST if reference_step <= SLOWEST_S else FEWEST_VALUES)
         found = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * enough[:, None]
         self._stretches += enough
         self._sums += found
@@ -101,17 +99,17 @@ class SharedNoise:
 
     def share(self) -> float:
         """Return the share of the DVL's noise in the reference, 0 to about 1; 0 if not significant."""
-        if self._stretches.max() < ENOUGH or np.abs(self._later).max() > UNCORRELATED_BELOW * self._square:
+        if self._stretches.max() < FEWEST_VALUES or np.abs(self._later).max() > UNCORRELATED_BELOW * self._square:
             return 0.0
         n = np.maximum(self._stretches, 2.0)[:, None]
         mean = self._sums / n
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
-        best = int(np.argmax(np.where(self._stretches >= ENOUGH, mean[:, 0], -math.inf)))
+        best = int(np.argmax(np.where(self._stretches >= FEWEST_VALUES, mean[:, 0], -math.inf)))
         c_4, v_4, steps = mean[best].tolist()
         if steps < Z_ONE_TEST * float(std[best, 2]):
             steps = 0.0
         passed, own = c_4 - steps, v_4 - steps
-        if own < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
+        if own < max(LEAST_SHARE * v_4, 70.0 * ROUNDING_MPS**2):
             return 0.0
         return passed / own if passed > max(SHARED_FROM * own, Z_BEST_SHIFT * float(std[best, 0])) else 0.0
 

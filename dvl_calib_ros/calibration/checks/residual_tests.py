@@ -25,19 +25,20 @@ from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
-from ..numerics.robust import median, robust_std
+from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, ROBUST_PASSES, median, robust_std
 from ..numerics.samples import Index
 from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
-from ..results.results import ARM, OFFSETS, Estimate
-from .beam_faults import BeamFault, beam_warning
+from ..results.results import OFFSETS, Estimate
+from .beam_faults import BIAS_STD, BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
+from .reference_independence import SLOWEST_S
 
 # Time constants, s, between which a change of tilt is the vehicle's; slower ones may be the IMU's error.
 TILT_S = 1.0, 15.0
 # Averaging time, s, of the velocity whose second derivative is tested.
 BEND_S = 1.0
-# Stretches, s, whose scatter gives σ, and the number of them needed.
-STRETCH_S, ENOUGH = 15.0, 12
+# Stretches, s, whose scatter gives σ.
+STRETCH_S = 15.0
 # Numbers of stretches combined for σ: slow errors of references and attitudes last a minute or two.
 QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
@@ -45,10 +46,10 @@ QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
 NUISANCE_STD: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2 + [0.1])
-# Prior σ of the tested signals: shares of tilt, second derivative (s²); DVL bias (m/s), tested on means over MEAN_S.
-SIGNAL_STD, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
-# Smallest tilt (rad, rms) and second derivative (m/s²) for a test, and share of tilt that the residual must follow.
-LEAST_TILT, MISSING_TILT_SHARE, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+# Prior σ of the tested signals: shares of tilt, second derivative (s²). The DVL bias is tested on means over MEAN_S.
+SIGNAL_STD, MEAN_S = np.array([10.0, 10.0, 10.0]), 5.0
+# Smallest tilt (rad, rms) for a test, and share of tilt that the residual must follow.
+LEAST_TILT, MISSING_TILT_SHARE = math.radians(0.08), 0.6
 # Prior σ of the bed's velocity, m/s: sediment in a flood, or a water layer. Below MOVES_FROM_MPS the reference may be
 # the cause: an inertial navigation at sea (recording T09) had an error of 0.054.
 BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
@@ -64,25 +65,16 @@ TYPICAL_BIAS_MPS, BIAS_UNOBSERVABLE_STD_MPS = 0.02, 0.008
 WRONG_SIGN_TILT_SHARE = 1.6
 # Mounting error (rad) from which it is reported.
 REPORTED_FROM_RAD = math.radians(0.2)
-# Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
-SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
-# Residual, relative to the median, beyond which it is an outlier; number of iterations.
-OUTLYING, ROUNDS = 4.0, 3
-# Smallest noise of the residual, m/s.
-QUIETEST_MPS = 1e-3
-# Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion, and a
-# reference that is interpolated follows the motion before.
-FILTER_MEMORIES_S, LONGEST_INTERVAL_S = (0.5, 1.0, 3.0), 0.3
-# Samples to either side that predict one; innovations beyond OUTLYING_INNOVATION σ are outliers.
-NEIGHBOURS, OUTLYING_INNOVATION = 12, 4.0
+# Time constant of smoothing (s) from which the calibration is rejected.
+TOO_SMOOTH_S = 0.6
+# Residual relative to the median, or innovation in σ, beyond which it is an outlier.
+OUTLYING = 4.0
+# Memories of a filter that are tested, s.
+FILTER_MEMORIES_S = 0.5, 1.0, 3.0
+# Samples to either side that predict one.
+NEIGHBOURS = 12
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
 OF_WAVES = 0.015
-# Delay of a reference that a filter explains: within this factor of the filter's time constant, and at least this, s.
-LAG_FACTOR, LEAST_LAG_S = 2.0, 0.2
-# Corrections (rad, scale, m) below these, or below `Z_ONE_TEST` σ, count as none.
-NO_ANGLE, NO_SCALE, NO_ARM_M = math.radians(0.35), 0.005, 0.2
-# Smallest share of DVL noise in a reference from positions: the motion on both sides in its window looks similar.
-POSITIONS_NOISE_SHARE = 0.1
 
 
 class ResidualTrend(NamedTuple):
@@ -132,12 +124,7 @@ class _Fit(NamedTuple):
 
 
 def residual_trend(
-    time: Array,
-    rotation_enu_from_body: Array,
-    velocity: Array,
-    error: Array,
-    rates: Array,
-    interval_s: float = 0.0,
+    time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
 ) -> ResidualTrend | None:
     """Fit the residual velocity; None for too little data.
 
@@ -149,7 +136,7 @@ def residual_trend(
     rates: (N, 3) rad/s, body.
     interval_s: sample interval of the reference, which is interpolated linearly, s.
     """
-    if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
+    if len(time) < 3 or time[-1] - time[0] < FEWEST_VALUES * STRETCH_S:
         return None
     up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # -1 for a z-down body
     roll = np.arctan2(up * rotation_enu_from_body[:, 2, 1], up * rotation_enu_from_body[:, 2, 2])
@@ -175,7 +162,6 @@ def residual_trend(
         (_at(time, each, BEND_S) - 2.0 * each + _at(time, each, -BEND_S)) / BEND_S**2 for each in (turning, earth)
     )
     quick[:, :, 2] = _turned(body_from_enu, bend)
-    bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
     # linear interpolation loses this part of the second derivative on average
     bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
     both = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), quick], axis=2)
@@ -186,7 +172,7 @@ def residual_trend(
     known = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
     by_heading = known[:, :, -1, None] * around[:, None]
     columns = np.concatenate([_means(each, starts) for each in (known, by_heading, constant)], axis=2)
-    likely = np.concatenate([NUISANCE_STD, BY_HEADING, CONSTANT])
+    likely = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
     means = _means(time, starts), columns, _means(error, starts)
     slow = _fitted(*means, likely, LASTING)
     likely[OVER_GROUND] = BED_STD_MPS
@@ -204,15 +190,15 @@ def residual_trend(
     lean = np.array([roll.mean(), pitch.mean()])
     speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
     # without tilt data, wave motion looks like turning
-    shows = bends > LEAST_BEND and max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
+    shows = max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
     # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
     bends_by = fast.seen_of(both, _turned(body_from_enu, whole_bend))
     shows = shows and bends_by > LEAST_OF_BEND
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_noise_in_reference(time, velocity - error, error, both, fast, interval_s), over_ground, over_bed.std[OVER_GROUND],
-        float(slow.x[-4]), float(slow.std[-4]),
+        *_noise_in_reference(time, velocity - error, error, both, fast, interval_s), over_ground,
+        over_bed.std[OVER_GROUND], float(slow.x[-4]), float(slow.std[-4]),
     )  # fmt: skip
 
 
@@ -237,27 +223,6 @@ def _neighbouring_means(time: Array, values: Array, starts: Index) -> Array:
     alone = before + after == 0.0
     means = np.where(alone, of_each, around / np.where(alone, 1.0, before + after))
     return np.repeat(means, np.diff(starts, append=len(time)), axis=0)
-
-
-def reference_lag_s(estimate: Estimate, parameters: Parameters) -> float:
-    """Return the estimated delay of the reference relative to the DVL, s."""
-    own = dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
-    return parameters.reference_time_offset - parameters.dvl_time_offset - own.get("time_offset", 0.0)
-
-
-def is_insignificant(estimate: Estimate) -> bool:
-    """Return whether a calibration finds nothing to correct except a delay.
-
-    False if fewer than two angles are known, because nothing was then tested. A filter of the DVL shows no lever arm of
-    its own.
-    """
-    terms = MODELS[estimate.model].error_terms_from_state
-    found = np.abs(terms @ estimate.state)
-    std = np.sqrt(np.diag(terms @ estimate.recording_covariance @ terms.T))
-    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, Z_ONE_TEST * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
-        return False
-    arm, own = estimate.std_of(*ARM), dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
-    return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, Z_ONE_TEST * arm)).any()
 
 
 def confused_with_bias_std(estimate: Estimate, parameters: Parameters) -> Array:
@@ -289,33 +254,29 @@ def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None
 def residual_warnings(
     found: ResidualTrend | None,
     of_positions: bool = False,
-    lag_s: float = 0.0,
-    finds_nothing: bool = False,
     mounting_std: Sequence[float] | Array = (0.0, 0.0, 0.0),
     beam: BeamFault | None = None,
     accepted: float = 0.01,
+    second_order: float = 0.0,
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
-    of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, finds_nothing,
-    mounting_std: see `reference_lag_s`, `is_insignificant`, `confused_with_bias_std`. accepted: error of the mounting
-    (rad, or share of the distance) that does not reject a calibration; nor does an error within its own 95 % interval.
+    of_positions: the reference's velocities are position differences, smoothed by their interval. mounting_std: see
+    `confused_with_bias_std`. accepted: error of the mounting (rad, or share of the distance) that does not reject a
+    calibration; nor does an error within its own 95 % interval.
+    second_order: square of the misalignment, rad²: the error of its first-order model, which looks like a beam.
     """
     if found is None:
         return []
-    smallest_share = POSITIONS_NOISE_SHARE if of_positions else 0.0
     seconds = math.sqrt(2.0 * abs(found.smoothed))
-    lag_fits_filter = lag_s > max(LEAST_LAG_S, seconds / LAG_FACTOR) and lag_s < LAG_FACTOR * seconds
     # a filter smooths and passes noise on: with evidence for one, the other needs less
     is_filter = not of_positions and found.smoothed > Z_95_PERCENT * found.smoothed_std
-    if found.circular > max((Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std, smallest_share):
+    if found.circular > (Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std:
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
-    if is_filter and lag_fits_filter and finds_nothing:
-        return [finding("FILTER_FINDS_NOTHING", late=lag_s).weighed(Severity.REJECT)]
     by_position_window = of_positions and found.smoothed > 0.0
     is_smoothed = abs(found.smoothed) > Z_REPEATED_TEST * found.smoothed_std
-    if is_smoothed and seconds > (TOO_SMOOTH_S if by_position_window else SMOOTHED_FROM_S):
-        severity = Severity.REJECT if seconds > TOO_SMOOTH_S and not by_position_window else Severity.MARGINAL
+    if is_smoothed and seconds > TOO_SMOOTH_S:
+        severity = Severity.MARGINAL if by_position_window else Severity.REJECT
         # smoothing causes any other signal
         return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(severity)]
     reasons = []
@@ -335,7 +296,7 @@ def residual_warnings(
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
         reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(severity))
     if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
-        reasons += beam_warning(beam, accepted)
+        reasons += beam_warning(beam, max(accepted, second_order))
     magnitude = np.abs(found.bias)
     shown = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
     if shown.any():
@@ -366,11 +327,11 @@ def _fitted(
     """Fit error (N, 3) = columns (N, 3, n) x; None for too few stretches."""
     stretch = np.floor((time - time[0]) / STRETCH_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(stretch, prepend=-1))
-    if len(starts) < ENOUGH:
+    if len(starts) < FEWEST_VALUES:
         return None
     n = columns.shape[2]
     rest = error
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_PASSES):
         square = (rest**2).sum(axis=1)
         level = max(float(median(square)), QUIETEST_MPS**2)
         weight = 1.0 / np.maximum(square / (OUTLYING**2 * level), 1.0)
@@ -408,14 +369,15 @@ def _noise_in_reference(
     both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
     step = float(median(np.diff(time)))
-    if max(step, interval_s) > LONGEST_INTERVAL_S or len(time) < 4 * NEIGHBOURS:
+    # in slower streams the innovation is motion, and a reference that is interpolated follows the motion before
+    if max(step, interval_s) > SLOWEST_S or len(time) < 4 * NEIGHBOURS:
         return 0.0, math.inf, 0.0
     innovation, rest = (np.zeros_like(dvl) for _ in range(2))
     for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):
         shares = _innovation_filter(values)
         for filtered, each in ((innovation, values), (rest, error[:, axis])):
             filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
-    limit = OUTLYING_INNOVATION * robust_std(innovation)
+    limit = OUTLYING * robust_std(innovation)
     # gaps break the prediction
     is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
     innovation[np.convolve(is_gap, np.ones(2 * NEIGHBOURS), "same") > 0.5] = 0.0

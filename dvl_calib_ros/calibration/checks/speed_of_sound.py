@@ -116,9 +116,9 @@ def water_document(water: Water) -> dict[str, Any]:
 
 def water_of_document(document: Mapping[str, Any]) -> Water:
     """Read the output of `water_document`. Raise LookupError, TypeError or ValueError if it is invalid."""
-    told = {each.name: document[_KEYS.get(each.name, each.name)] for each in fields(Water)}
-    source = str(told.pop("source"))
-    return Water(**{name: math.nan if each is None else float(each) for name, each in told.items()}, source=source)
+    values = {each.name: document[_KEYS.get(each.name, each.name)] for each in fields(Water)}
+    source = str(values.pop("source"))
+    return Water(**{name: math.nan if each is None else float(each) for name, each in values.items()}, source=source)
 
 
 class CauseOfScale(NamedTuple):
@@ -213,6 +213,7 @@ def _used(water: Water) -> str:
 
 
 def _of_water(water: Water, speed: Between) -> str:
+    """Return temperature, source, salinity and speed of sound of the water, as text."""
     salinity = "unknown salinity (0 to 40 PSU)" if math.isnan(water.salinity) else f"{water.salinity:.1f} PSU"
     source = f" ({water.source})" if water.source else ""
     named = f"water of {water.temperature:.1f} °C{source} and {salinity}"

@@ -202,7 +202,7 @@ def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
 
 
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
-    """Raise InputError if two names refer to one calibration, which would confirm itself."""
+    """Raise InputError for a calibration that is given twice: its differences would be zero."""
     for one, other in combinations(calibrations, 2):
         of_one, of_other = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
         if of_one == of_other and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
@@ -259,14 +259,14 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     base = several[0]
     if any(not each.dvl or each.dvl != base.dvl for each in several):
         several = [replace(each, dvl="", by_bias=np.zeros_like(each.by_bias)) for each in several]
-    shown = np.any([each.shown for each in several], axis=0)
+    observable = np.any([each.shown for each in several], axis=0)
     values = np.array([_near(each.value, base.value) for each in several])
     found, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: value of the first
     covariance = np.zeros((N_COMPONENTS, N_COMPONENTS))
     own, columns = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
     information, vector = own.sum(axis=0), np.einsum("nij,nj->i", own, values)
     turned = own @ columns
-    for index in (group[shown[group]] for group in GROUPS):
+    for index in (group[observable[group]] for group in GROUPS):
         # bias of σ 1 as an additional state
         across = turned[:, index].sum(axis=0)
         of_bias = np.eye(N_AXES) + np.einsum("nia,nib->ab", columns[:, index], turned[:, index])
@@ -282,7 +282,7 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
         last_ns=max(each.last_ns for each in several),
         value=found,
         covariance=covariance + by_bias @ by_bias.T,
-        shown=shown,
+        shown=observable,
         dvl=several[0].dvl,
         by_bias=by_bias,
         used=sum(each.used for each in several),
@@ -377,9 +377,9 @@ def _same(comparison: Comparison) -> Reason:
     """Return the smallest movement that would be found, or that no single date explains the differences."""
     scatter = comparison.scatter
     if scatter.freedom and scatter.p < CHANCE:
-        apart = max(float(np.nanmax(np.abs(pair.value[ANGLES]), initial=0.0)) for pair in comparison.pairs)
+        change = max(float(np.nanmax(np.abs(pair.value[ANGLES]), initial=0.0)) for pair in comparison.pairs)
         numbers = {"chi_square": scatter.value, "freedom": scatter.freedom, "p": scatter.p}
-        return finding("MOUNTING_SCATTERS", count=len(comparison.calibrations), apart=math.degrees(apart), **numbers)
+        return finding("MOUNTING_SCATTERS", count=len(comparison.calibrations), apart=math.degrees(change), **numbers)
     smallest = np.degrees(comparison.smallest)
     seen = [f"{name} {each:.1f}°" for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(each)]
     unseen = [name for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(each)]
@@ -491,6 +491,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
 
 
 def _difference_document(difference: Difference) -> dict[str, Any]:
+    """Return plain data of a difference."""
     return {
         "first": difference.first.name,
         "second": difference.second.name,

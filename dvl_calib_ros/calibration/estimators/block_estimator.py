@@ -26,6 +26,7 @@ from ..filters.filter_setup import prior
 from ..filters.observability import OBSERVED_SHARE, body_angle_std
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models.own import BIAS, DELAY, LEVER_ARM, N_STATE, PHI, REFERENCE_ERROR
+from ..numerics.block_covariance import BLOCK_NS
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
@@ -37,21 +38,15 @@ from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .block_solver import BlockSolver, Outcome
-from .estimator import AtOnce, Estimator, EstimatorSetup, Rest
+from .estimator import SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup, Residuals
 from .full_forward_model import deviation_of
 from .slow_errors import Priors
 
-BLOCK_NS = 10_000_000_000  # length of a block
 # Time after which the DVL's rate is known, ns; memory is then reserved for this multiple of its samples.
 RATE_FROM_NS, ROOM = 3_000_000_000, 1.1
 LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
-# From a block's last data until its result takes effect, in stamps, ns. A worker needs a hundredth of it; when a
-# recording is played fast, the node waits for the worker.
-SOLVED_WITHIN_NS = 1_000_000_000
 # Delay of the DVL, s, beyond which pairing at the uncorrected stamps may find no reference.
 PAIRED_WITHIN_S = 0.3
-# A state is observable once the data have reduced its prior σ to this share.
-SHOWN_SHARE = 0.5
 # The lever arm is reported to look like an angle if it causes this multiple of the angle's other variance.
 ARM_SHARE = 30.0
 # States that the reference's clock offset makes uncertain, in the order of `Registration.left_open`.
@@ -118,7 +113,7 @@ class FullEstimator(Estimator):
         return self._n_taken
 
     @property
-    def told_until_ns(self) -> int | None:
+    def affected_from_ns(self) -> int | None:
         """Stamp of the first DVL sample that a gathered block may still affect; None without any."""
         return self._gathered_ns[0] if self._gathered_ns else None
 
@@ -210,9 +205,9 @@ class FullEstimator(Estimator):
         """See `Estimator`."""
         return self._idle_solver().is_horizontal
 
-    def rest(self, *, fresh: bool) -> Rest | None:
+    def residuals(self, *, fresh: bool) -> Residuals | None:
         """See `Estimator`."""
-        return self._idle_solver().rest() if fresh else self._result_in_effect.looked.rest
+        return self._idle_solver().residuals() if fresh else self._result_in_effect.looked.residuals
 
     @property
     def registration_so_far(self) -> Registration | None:
@@ -225,7 +220,7 @@ class FullEstimator(Estimator):
         return self._result_in_effect.suggestion
 
     @property
-    def n_told(self) -> int:
+    def n_results(self) -> int:
         """Number of blocks in effect."""
         return self._n_updates
 
@@ -357,6 +352,7 @@ class FullEstimator(Estimator):
             self._solve_gathered()
 
     def _solve_gathered(self) -> None:
+        """Solve the gathered blocks, if any."""
         if self._gathered:
             blocks, effect_ns = self._gathered, self._gathered_ns
             self._gathered, self._gathered_ns = [], []
@@ -491,7 +487,7 @@ class FullEstimator(Estimator):
         for begins_ns, (x, p) in zip(first_ns, states, strict=False):
             std = np.sqrt(np.diag(p))
             (east, north), (east_std, north_std) = x[offset].tolist(), std[offset].tolist()
-            shown = bool(p[DELAY, DELAY] <= SHOWN_SHARE**2 * known)
+            shown = bool(p[DELAY, DELAY] <= OBSERVED_SHARE**2 * known)
             late = nominal + float(x[DELAY])
             days.append(Day(begins_ns, late, float(std[DELAY]), shown, (east, north), (east_std, north_std)))
         return tuple(days)

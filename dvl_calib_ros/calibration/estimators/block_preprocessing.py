@@ -1,7 +1,7 @@
 """Time blocks of all streams prepared for the fit: copied, thinned, in seconds, without outliers.
 
-In a fast stream, neighbours identify an outlier (outliers.py). Between samples of a slow stream a vehicle may turn, so
-there `full` tests suspicious samples by the references near them (`JointFit`).
+Neighbours identify an outlier (outliers.py). Between samples of a slow stream a vehicle may turn, so a larger scatter
+is assumed there.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ from ..streams.outliers import without_spikes
 from ..streams.position_velocities import are_positions, of_moments
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
-# Largest turn rate of a vehicle with a DVL, rad/s.
-FASTEST_TURN = 20.0
 # Smallest scatter about interpolation, m/s, assumed of a stream. SLOW_S: interval (s) from which the larger value
 # applies, because a vehicle turns between samples.
 LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
@@ -108,8 +106,7 @@ def _dvl_columns(block: Block, p: Parameters, epoch_ns: int) -> tuple[DvlColumns
 
 def _imu(samples: ImuSamples, epoch_ns: int) -> ImuColumns:
     values = samples.values
-    rates = np.where(np.abs(values[:, 4:7]) < FASTEST_TURN, values[:, 4:7], np.nan)
-    return ImuColumns(seconds(samples.stamps_ns, epoch_ns), values[:, :4], rates)
+    return ImuColumns(seconds(samples.stamps_ns, epoch_ns), values[:, :4], values[:, 4:7])
 
 
 def _reference(

@@ -22,9 +22,18 @@ from ..numerics.kalman import GaussianState
 from ..numerics.tables import return_memory
 from ..registration.registration import Registration
 from ..results.thinned_recording import MEASURED_BELOW, ThinnedBlock, mean_around
-from ..streams.interpolation import LONGEST_DELAY_S, DvlColumns, ImuColumns, InBody, attitude_at, in_body
+from ..streams.interpolation import (
+    BIN_S,
+    FASTER_THAN_S,
+    LONGEST_DELAY_S,
+    DvlColumns,
+    ImuColumns,
+    InBody,
+    attitude_at,
+    in_body,
+)
 from .block_preprocessing import Block, Cleaned, cleaned, seconds
-from .estimator import Rest
+from .estimator import Residuals
 from .full_fit import JointFit
 from .full_forward_model import FitBlock, spline_slopes
 from .registration_schedule import FitSoFar, KeptClocks, Looked
@@ -33,8 +42,6 @@ from .registration_schedule import FitSoFar, KeptClocks, Looked
 MARGIN_S = LONGEST_DELAY_S + 0.8
 # DVL samples needed for a spline.
 FEWEST_DVL = 6
-# Shortest interval of attitude and angular velocity in the fit, s.
-IMU_EVERY_S = 0.1
 
 
 class Outcome(NamedTuple):
@@ -116,9 +123,9 @@ class BlockSolver:
         """Return the registration of clocks and frames; None if the data do not determine it."""
         return self._clocks.looked(self._so_far).registration
 
-    def rest(self) -> Rest | None:
+    def residuals(self) -> Residuals | None:
         """Return the calibration's residuals, live only; else None."""
-        return self._clocks.looked(self._so_far).rest
+        return self._clocks.looked(self._so_far).residuals
 
     @property
     def _so_far(self) -> FitSoFar | None:
@@ -219,12 +226,12 @@ class BlockSolver:
 def _as_if_still(block: Block, epoch_ns: int) -> ImuColumns:
     """Return an IMU without rotation, in place of a missing one, for references in body axes."""
     from_s, end_s = seconds(np.array([block.from_ns, block.end_ns]), epoch_ns).tolist()
-    times = np.arange(from_s - MARGIN_S, end_s + MARGIN_S, IMU_EVERY_S)
+    times = np.arange(from_s - MARGIN_S, end_s + MARGIN_S, BIN_S)
     return ImuColumns(times, np.full((len(times), 4), np.nan), np.zeros((len(times), 3)))
 
 
 def _thinned_imu(imu: ImuColumns, from_s: float, end_s: float) -> ImuColumns:
-    """Return attitude and mean angular velocity every IMU_EVERY_S where known; attitude nan if there is none.
+    """Return attitude and mean angular velocity every BIN_S where known; attitude nan if there is none.
 
     Quaternion signs are continuous.
     """
@@ -234,9 +241,9 @@ def _thinned_imu(imu: ImuColumns, from_s: float, end_s: float) -> ImuColumns:
     known &= oriented if oriented.any() else True
     times, orientation, rates = times[known], orientation[known], rates[known]
     at = np.arange(len(times))
-    if len(times) > 1 and times[-1] - times[0] < 0.7 * IMU_EVERY_S * len(times):
-        at = np.flatnonzero(np.diff(np.floor(times / IMU_EVERY_S), prepend=-np.inf))
-        rates = mean_around(times, rates, times[at], 0.5 * IMU_EVERY_S)
+    if len(times) > 1 and times[-1] - times[0] < FASTER_THAN_S * len(times):
+        at = np.flatnonzero(np.diff(np.floor(times / BIN_S), prepend=-np.inf))
+        rates = mean_around(times, rates, times[at], 0.5 * BIN_S)
     orientation = orientation[at]
     flips = np.cumprod(np.where((orientation[1:] * orientation[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
     orientation = orientation * np.append(1.0, flips)[: len(at), None]

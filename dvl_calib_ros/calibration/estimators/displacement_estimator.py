@@ -37,12 +37,10 @@ from .displacement_least_squares import (
     solve,
     white_noise,
 )
-from .estimator import NEVER, AtOnce, Estimator, EstimatorSetup
+from .estimator import NEVER, SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup
 
 # Time of the first solution, s, and growth of the run between solutions.
 FIRST_LOOK_S, GROWN = 60.0, 1.2
-# From a solution's stamp until it takes effect, in stamps, ns.
-SOLVED_WITHIN_NS = 1_000_000_000
 # Velocities from positions are too noisy beyond NOISY_MPS. They do not exist for fixes further apart than this number
 # of windows (position_velocities.py).
 LONGEST_WINDOWS = 3.0
@@ -130,6 +128,7 @@ class Displacements(Estimator):
         self._coming.append((at_ns + SOLVED_WITHIN_NS, self._worker.submit(looked)))
 
     def _let_take_effect(self, reached_ns: int) -> None:
+        """Publish the solutions that take effect up to a stamp (ns)."""
         while self._coming and self._coming[0][0] <= reached_ns:
             from_ns, solved = self._coming.popleft()
             self._last_result = solved.result()
@@ -155,6 +154,7 @@ class Displacements(Estimator):
     # ------------------------------------------------------------------ what is known
 
     def _fit(self) -> DisplacementFit | None:
+        """Return the fit of all legs inside `settled`, else the latest published fit."""
         if not self._is_settled:
             return self._last_result.fit
         self.take_rows()
@@ -181,7 +181,7 @@ class Displacements(Estimator):
         return ModelCounts(used, gated, 2.0 if used else math.nan, 2.0, 0)
 
     @property
-    def n_told(self) -> int:
+    def n_results(self) -> int:
         """Number of solutions in effect."""
         return self._n_updates
 
@@ -258,8 +258,9 @@ def _noise_of_velocities(legs: Legs, parameters: Parameters) -> float:
     return math.sqrt(2.0) * white_noise(legs, np.array(parameters.lever_arm)) / max(window_s, interval)
 
 
-# Time before a fix over which a velocity error is averaged, s; over less, position noise dominates.
-OVER_S = 60.0
+# Time before a fix over which a velocity error is averaged, and longest held-out leg, s: over less, position noise
+# dominates.
+LEG_S = 60.0
 
 
 def navigated(
@@ -296,27 +297,27 @@ def navigated(
         own = numbers[at] % len(states) == fold
         after[own] = steps(left(state.x))[own]
     moved = steps(np.einsum("nabc,bc->na", legs.way, parameters.rotation_dvl_from_body.T))
-    along = np.cumsum(np.linalg.norm(moved, axis=1))
-    if along[-1] < SHORTEST_M:
+    distance = np.cumsum(np.linalg.norm(moved, axis=1))
+    if distance[-1] < SHORTEST_M:
         return None
-    ends = ends_of_stretches(along)
+    ends = ends_of_stretches(distance)
     astray = [np.cumsum(each, axis=0) for each in (before, after)]
     reference = np.cumsum(steps(legs.position), axis=0)
-    stretch_m = float(along[-1] if len(ends) == 2 else along[ends[1]] - along[ends[0]])
+    stretch_m = float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]])
     noise = float(np.sqrt(2.0 * np.var(of_all[at, :2], axis=0).sum()))
     kept = np.round(np.linspace(0, len(at) - 1, min(POINTS, len(at)))).astype(np.intp)
     in_body = [_velocities(each, seconds, legs.rotation[at])[kept] for each in astray]
     return Navigation(
-        distance_m=float(along[-1]),
+        distance_m=float(distance[-1]),
         seconds=float(step_s.sum()),
         stretch_m=stretch_m,
         stretches=len(ends) - 1,
-        before=drift_over(astray[0], along, ends),
-        after=drift_over(astray[1], along, ends),
+        before=drift_over(astray[0], distance, ends),
+        after=drift_over(astray[1], distance, ends),
         noise_per_km=1000.0 * noise / stretch_m,
         on_a_map=True,
         stamps_ns=first_ns + np.round(seconds[kept] * 1e9).astype(np.int64),
-        distances=along[kept],
+        distances=distance[kept],
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],
@@ -326,8 +327,8 @@ def navigated(
 
 
 def _velocities(astray: Array, seconds: Array, rotation_enu_from_body: Array) -> Array:
-    """Return mean velocity errors (N, 3) m/s, body axes, over `OVER_S` before each fix, from track errors (N, 2) m."""
-    since = np.searchsorted(seconds, seconds - OVER_S)
+    """Return mean velocity errors (N, 3) m/s, body axes, over `LEG_S` before each fix, from track errors (N, 2) m."""
+    since = np.searchsorted(seconds, seconds - LEG_S)
     passed = np.maximum(seconds - seconds[since], 1.0)[:, None]
     enu = np.concatenate([(astray - astray[since]) / passed, np.zeros((len(seconds), 1))], axis=1)
     return np.asarray(np.einsum("nji,nj->ni", rotation_enu_from_body, enu))
@@ -335,7 +336,7 @@ def _velocities(astray: Array, seconds: Array, rotation_enu_from_body: Array) ->
 
 # Length of a held-out leg, s: at most LEG_S against position noise, and shorter to have LEGS of them; at least
 # SHORTEST_LEG_S, and no more than MOST_LEGS legs.
-LEG_S, SHORTEST_LEG_S, LEGS, MOST_LEGS = 60.0, 20.0, 30.0, 200.0
+SHORTEST_LEG_S, LEGS, MOST_LEGS = 20.0, 30.0, 200.0
 # Share of a leg at each end whose fixes are averaged.
 END_SHARE = 0.25
 

@@ -15,18 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..models.parameters import Parameters
+from ..numerics.block_covariance import BLOCK_S
 from ..numerics.error_model import correction_matrix
 from ..numerics.frames import Array, rotation_from_quaternion
 from ..numerics.kalman import GaussianState
-from ..numerics.robust import median, robust_std
+from ..numerics.robust import FEWEST_VALUES, ROBUST_PASSES, median, robust_std
 from ..numerics.samples import Index, Mask, Stamps
 
 N_ERRORS, N_THETA = 4, 13
 SCALE, ARM, LATE, DEVIATION, DRIFT = 3, slice(4, 7), 7, slice(8, 13), 12
-# Fixes needed for a fit.
-ENOUGH_FIXES = 12
-# Shortest block of time, s, and largest number of blocks, which are solved together.
-SHORTEST_BLOCK_S, MOST_BLOCKS = 10.0, 120
+# Largest number of blocks of time, which are solved together.
+MOST_BLOCKS = 120
 # A fix is an outlier beyond this number of σ from the median of its neighbours to either side.
 OUTLYING, NEIGHBOURS = 4.5, 6
 # Limit for outliers that last for minutes, in σ from the median of a stretch; drift spreads evenly and stays below.
@@ -44,7 +43,6 @@ _DEVIATES_LOG: Array = -0.5 * (np.log(DEVIATES) / np.log(4.0)) ** 2
 _SHARE: Array = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
 # Variance of a stretch's constant, relative to the largest other variance.
 ANYWHERE = 1e5
-ROUNDS = 3  # iterations of linearisation and outlier rejection
 # Smallest noise of a fix against dead reckoning, m: in turns a delayed fix is wrong by half the acceleration times
 # delay².
 FINEST_M = 0.3
@@ -106,25 +104,25 @@ def _prior(errors: GaussianState, parameters: Parameters, span_s: float) -> Gaus
 
 def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
     """Return the fit, or None for too few fixes; see `solve`."""
-    if len(legs.seconds) < ENOUGH_FIXES:
+    if len(legs.seconds) < FEWEST_VALUES:
         return None
     prior = _prior(errors, parameters, float(np.ptp(legs.seconds)))
     std = np.sqrt(np.diag(prior.p))
     theta = prior.x
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_PASSES):
         theta = _first_fit(linear_about(legs, theta, parameters), legs, std)
     used = np.ones(len(legs.seconds), dtype=bool)
     state = GaussianState(theta, prior.p)
     noise = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_PASSES):
         linear = linear_about(legs, state.x, parameters)
         left = linear.y - linear.columns @ state.x
         used = _no_outliers(left[:, :2], legs.stretch)
-        if used.sum() < ENOUGH_FIXES:
+        if used.sum() < FEWEST_VALUES:
             return None
         state, noise = _fitted(_means(linear, legs, used, (0, 1)), prior)
         has_height = used & np.isfinite(legs.variance[:, 2]) & (np.abs(legs.position[:, 2]) < FARTHEST_M)
-        if has_height.sum() >= ENOUGH_FIXES:
+        if has_height.sum() >= FEWEST_VALUES:
             state, _ = _fitted(_means(linear, legs, has_height, (2,)), state)
     # a heading drift with unknown zero makes yaw uncertain; an unknown pitch ε changes the scale by ε²/2
     span_s, (x, p) = float(np.ptp(legs.seconds)), state
@@ -215,7 +213,7 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
     """Average the fixes in use over blocks of time."""
     at = np.flatnonzero(use)
     seconds = legs.seconds[at]
-    length = max(SHORTEST_BLOCK_S, float(seconds[-1] - seconds[0]) / MOST_BLOCKS)
+    length = max(BLOCK_S, float(seconds[-1] - seconds[0]) / MOST_BLOCKS)
     number = np.floor((seconds - seconds[0]) / length).astype(np.intp)
     key = np.stack([legs.stretch[at], number])
     first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))
@@ -491,6 +489,7 @@ class DeadReckoning:
 
 
 def _no_legs() -> Legs:
+    """Return an empty set of legs."""
     nothing = np.zeros((0, 3))
     turned = np.zeros((0, 3, N_HEADING))
     none = np.zeros(0, dtype=np.intp)

@@ -34,6 +34,9 @@ from ..results.thinned_recording import Terms, ThinnedRecording
 from ..streams.aligner import Aligner
 
 NEVER = 2**63 - 1  # number of a row that never comes
+# From the last data of a solution until it takes effect, in stamps, ns. A worker needs a hundredth of it; when a
+# recording is played fast, the node waits for the worker.
+SOLVED_WITHIN_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ class Estimator(ABC):
         """Most significant fault of one beam of the DVL; None if not tested."""
         return None
 
-    def rest(self, *, fresh: bool) -> Rest | None:
+    def residuals(self, *, fresh: bool) -> Residuals | None:
         """Return the calibration's residuals, evaluated now if `fresh`, else the latest; None if not available."""
         return None
 
@@ -146,7 +149,7 @@ class Estimator(ABC):
         return None
 
     @property
-    def n_told(self) -> int:
+    def n_results(self) -> int:
         """Counter that grows when there may be new results besides the state."""
         return self.counts.used
 
@@ -161,7 +164,7 @@ class Estimator(ABC):
         return NO_EVIDENCE
 
     @property
-    def told_until_ns(self) -> int | None:
+    def affected_from_ns(self) -> int | None:
         """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
         return None
 
@@ -266,10 +269,10 @@ class LinearEstimator(Estimator):
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
         """See `Estimator`."""
-        standing = trace.standing(self._group, numbers)
+        snapshot = trace.snapshot(self._group, numbers)
         name = self._model.name
-        used, nis_sum = self._group.counts_at(name, standing)
-        return self._group.states_at(name, standing), used, nis_sum
+        used, nis_sum = self._group.counts_at(name, snapshot)
+        return self._group.states_at(name, snapshot), used, nis_sum
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
         """See `Estimator`."""
@@ -311,7 +314,7 @@ class AtOnce(Executor):
         return done
 
 
-class Rest(NamedTuple):
+class Residuals(NamedTuple):
     """Residuals of a calibration.
 
     held_out: velocity error on held-out data. typical: m/s rms with the state from all data, without outliers; None

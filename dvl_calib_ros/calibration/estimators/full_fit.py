@@ -20,15 +20,16 @@ from ..checks.beam_faults import N_EFFECTS, BeamFault, effect_velocities, most_s
 from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, REFERENCE_ERROR, SCALE
 from ..models.parameters import Parameters
-from ..numerics.block_covariance import TimeBlocks
+from ..numerics.block_covariance import BLOCK_S, TimeBlocks
 from ..numerics.frames import Array, product
 from ..numerics.kalman import GaussianState, covariance_of
-from ..numerics.robust import MEDIAN_DISTANCE
+from ..numerics.robust import MEDIAN_DISTANCE, ROUNDING_MPS
 from ..numerics.samples import Index
+from ..results.results import TAPE_STD_M
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
-from .section_rows import GATE, SECTION_S, SectionRows, effects_gram, masked_median, section_starts, usual_square
+from .section_rows import GATE, SectionRows, effects_gram, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
 OF_DAY = FULL.of_day
@@ -38,27 +39,25 @@ OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
 FAR = 1.0
 # Gauss-Newton steps at a renewal: at most STEPS, or until a step is below LAST_STEP σ.
 STEPS, LAST_STEP = 8, 0.3
-# Blocks whose streams are kept (40 minutes); the contribution of older ones stays fixed.
+# Blocks whose streams are kept (40 minutes), because a node's memory must not grow. Older ones contribute a fixed sum,
+# and registration uses at most the rows of a third of them.
 KEPT_BLOCKS = 240
 # Points of the slow errors' prior for the numerical integration.
 POINTS = 16
 # The points are re-centred when the data move them by OFF_CENTRE σ of the prior, at most RECENTRED times.
 OFF_CENTRE, RECENTRED = 0.7, 4
-# A configured lever arm is a tape measurement with this σ, m, and wrong with probability WRONG_TAPE.
-TAPE_STD_M, WRONG_TAPE = 0.05, 0.1
+# Prior probability of each exception: a wrong configured lever arm, a vehicle that sinks or rises by its trim, one that
+# dives, and a large vertical error of the reference.
+EXCEPTION = 0.1
 # A vehicle at the surface or at constant depth ends at the height at which it began, within LEVEL_M (tide, waves) and
-# its own excursions. With probability SLOWLY it sinks or rises by its trim (σ SLOW_MPS), and with probability CLIMBS it
-# dives (σ CLIMB_MPS). Vertical reference error: with probability OFFSET it has σ OFFSET_MPS (an antenna's model)
-# instead of `reference_offset_std`.
-LEVEL_M, SLOWLY, SLOW_MPS, CLIMBS, CLIMB_MPS = 1.0, 0.1, 0.02, 0.1, 0.3
-OFFSET, OFFSET_MPS = 0.1, 0.05
-# Smallest white noise of a velocity, m/s. Degrees of freedom needed to estimate the noise of bins.
-LEAST_NOISE_MPS, FEWEST = 1e-4, 6
+# its own excursions; else it sinks or rises by its trim (σ SLOW_MPS), or dives (σ CLIMB_MPS).
+LEVEL_M, SLOW_MPS, CLIMB_MPS = 1.0, 0.02, 0.3
+# σ of a large vertical reference error (an antenna's model), m/s, instead of `reference_offset_std`.
+OFFSET_MPS = 0.05
+# Degrees of freedom needed to estimate the noise of bins.
+FEWEST = 6
 # Squared residual of three axes, in variances, beyond which a row is an outlier.
 GATED = 4.0 * GATE
-# A sample of a slow DVL is rejected if the references near it then fit better: by LEAST_GAIN (chi-square), and to this
-# share.
-LEAST_GAIN, SHARE_LEFT = 50.0, 0.5
 # A section is rejected if its median differs from the others' by GROSS of their σ and by GROSS_MPS (m/s): no slow error
 # is so large.
 GROSS, GROSS_MPS = 10.0, 0.5
@@ -153,7 +152,7 @@ class JointFit:
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
         self._slow, self._deviation, self._log_prior = self._points()
         self._known: dict[tuple[int | None, int | None, bool, int], _Hypotheses] = {}
-        self.used = self._gated = self._left_out = 0
+        self.used = self._gated = 0
         self._misfit = 0.0
         self._fitted: JointEstimate | None = None
         self._without: tuple[JointEstimate | None, list[list[GaussianState]]] | None = None
@@ -215,7 +214,6 @@ class JointFit:
             self._renew()
             return
         x = self._linear[self._of_day(len(self._days) - 1)]
-        day.blocks[-1] = block = self._without_contradicted(day, block, x)
         self._add_parts(day, self._parts([block], x), x)
         self._solve()
         if self._is_far():
@@ -235,8 +233,8 @@ class JointFit:
 
     @property
     def gated(self) -> int:
-        """Number of rejected references and slow DVL samples."""
-        return self._gated + self._left_out
+        """Number of rejected references."""
+        return self._gated
 
     @property
     def mean_misfit(self) -> float:
@@ -293,7 +291,7 @@ class JointFit:
             assert self._fitted is not None
             state = self._fitted.state
             step = (self._x - before) / np.sqrt(np.diag(state.p))
-            if not self._are_contradicted() and np.abs(step).max() < LAST_STEP:
+            if np.abs(step).max() < LAST_STEP:
                 break
             # acceleration columns reduced for noise make steps too long: halve a step that turns back
             self._x, last = 0.5 * (before + self._x) if step @ last < 0.0 else self._x, step
@@ -329,41 +327,6 @@ class JointFit:
             self._measure_noise(day, parts)
             self._add_parts(day, parts, x)
 
-    def _are_contradicted(self) -> bool:
-        """Apply `_without_contradicted` to all blocks. Return whether any sample was rejected."""
-        found = False
-        for number, day in enumerate(self._days):
-            x = self._x[self._of_day(number)]
-            for place, block in enumerate(day.blocks):
-                day.blocks[place] = self._without_contradicted(day, block, x)
-                found = found or day.blocks[place] is not block
-        return found
-
-    def _without_contradicted(self, day: _Day, block: FitBlock, x: Array) -> FitBlock:
-        """Reject suspicious samples of a slow DVL without which the references near them fit much better.
-
-        Neighbours alone do not prove an outlier, because the vehicle may turn between samples. x: (20,).
-        """
-        suspicious = block.suspicious.tolist() if np.isfinite(day.single).all() else []
-        for at in reversed(suspicious):
-            fewer = block.without(np.array([at]))
-            (times, before), (also, after) = (self._misfits(day, each, x) for each in (block, fewer))
-            near = np.abs(times - x[REFERENCE_DELAY] + x[DELAY] - block.dvl.times[at]) < block.interval_s
-            both = near & np.isin(times, also, assume_unique=True)
-            left = after[np.searchsorted(also, times[both])].sum()
-            if before[both].sum() - left > LEAST_GAIN and left < SHARE_LEFT * before[both].sum():
-                self._left_out += int(block.from_s <= block.dvl.times[at] < block.end_s)
-                block = fewer
-        return block
-
-    def _misfits(self, day: _Day, block: FitBlock, x: Array) -> tuple[Array, Array]:
-        """Return times (J,) s and squared residuals (J,) of a block's references about a state (20,)."""
-        parts = [part for part in self._parts([block], x) if part.rows is not None]
-        if not parts:
-            return np.zeros(0), np.zeros(0)
-        times = np.concatenate([part.rows.times for part in parts if part.rows is not None])
-        return times, np.concatenate([part.misfit(day.single) for part in parts])
-
     def _parts(self, blocks: Sequence[FitBlock], x: Array) -> list[SectionRows]:
         """Return the sections of blocks about a state (20,) of their day."""
         found = []
@@ -383,10 +346,10 @@ class JointFit:
         levels = np.array([part.level for part in parts if part.rows is not None])
         day.level = masked_median(levels)
         day.level_std = np.maximum(masked_median(np.abs(levels - day.level)) / MEDIAN_DISTANCE, GROSS_MPS / GROSS)
-        day.single = np.maximum(usual_square(np.concatenate(left)), LEAST_NOISE_MPS**2)
+        day.single = np.maximum(usual_square(np.concatenate(left)), ROUNDING_MPS**2)
         each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
         total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))
-        white = np.maximum(total / np.maximum(freedom, 1.0), LEAST_NOISE_MPS**2)
+        white = np.maximum(total / np.maximum(freedom, 1.0), ROUNDING_MPS**2)
         day.white = np.where(freedom < FEWEST, day.single, white)
 
     def _add_parts(self, day: _Day, parts: Sequence[SectionRows], x: Array) -> None:
@@ -409,9 +372,10 @@ class JointFit:
                 self._misfit += float(misfit[good].sum())
                 bins = part.bins(day.single)
                 gram, fold = gram_of(bins, day.white, x, part.slope_variance), int(bins.fold[len(bins.fold) // 2])
-            self._append(day, _Section(SECTION_S, gram, fold, None if gram is None else part.up(x)))
+            self._append(day, _Section(BLOCK_S, gram, fold, None if gram is None else part.up(x)))
 
     def _append(self, day: _Day, section: _Section) -> None:
+        """Append a section to the chain of its day."""
         assert day.chain is not None
         day.sections.append(section)
         day.chain = day.chain.after(section.gram, section.seconds, self._slow)
@@ -512,8 +476,8 @@ class JointFit:
             if len(rows) > 1:
                 at, up = self._of_day(number), np.array(rows)
                 velocity = up[:, :-1] @ self._x[at] + up[:, -1]
-                path = SECTION_S * np.cumsum(velocity - velocity.mean())
-                std = (LEVEL_M + float(np.ptp(path))) / (SECTION_S * len(up))
+                path = BLOCK_S * np.cumsum(velocity - velocity.mean())
+                std = (LEVEL_M + float(np.ptp(path))) / (BLOCK_S * len(up))
                 found.append(_Climb(at, up.mean(axis=0), min(std, CLIMB_MPS)))
         return found
 
@@ -561,9 +525,10 @@ class JointFit:
         """
         key = points.start, points.stop, seen_climbing, len(self._days)
         if key not in self._known:
-            arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
-            offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if seen_climbing else {0.0: 1.0}
-            paths = {0.0: 1.0 - SLOWLY - CLIMBS, SLOW_MPS: SLOWLY, CLIMB_MPS: CLIMBS} if seen_climbing else {0.0: 1.0}
+            arms = {TAPE_STD_M: 1.0 - EXCEPTION, math.inf: EXCEPTION} if self._arm_is_given else {math.inf: 1.0}
+            offsets = {0.0: 1.0 - EXCEPTION, OFFSET_MPS: EXCEPTION} if seen_climbing else {0.0: 1.0}
+            climbs = {SLOW_MPS: EXCEPTION, CLIMB_MPS: EXCEPTION} if seen_climbing else {}
+            paths = {0.0: 1.0 - sum(climbs.values()), **climbs}
             cases = list(itertools.product(arms, offsets))
             priors = [self._by_prior(points, arm, offset) for arm, offset in cases]
             information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))

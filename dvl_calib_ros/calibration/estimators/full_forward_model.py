@@ -7,7 +7,7 @@ alone. The DVL's velocity is interpolated by a cubic spline: a straight line los
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
 from types import EllipsisType
@@ -31,10 +31,9 @@ from ..models.own import (
 from ..models.parameters import Parameters
 from ..numerics.frames import Array, cross, rotation_from_quaternion, skew, squared, turned_skew
 from ..numerics.kalman import GaussianState
-from ..numerics.robust import MEDIAN_SQUARE, robust_std
-from ..numerics.samples import Index, Mask
+from ..numerics.robust import MEDIAN_SQUARE
+from ..numerics.samples import Mask
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
-from ..streams.outliers import deviation_from_neighbours, neighbours
 
 # Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad).
 SLOW = 6
@@ -42,11 +41,8 @@ SLOW = 6
 TURNING_S = 0.1
 # At sample intervals below this, s, slopes come from parabolas instead of a spline.
 DENSE_S = 0.15
-# Outlier search needs this number of DVL samples. In a stream with longer intervals than SLOW_S (s), a sample is
-# suspicious beyond this number of σ, where σ is at least LEAST_SCATTER_MPS.
-FEWEST_DVL, SLOW_S, SUSPICIOUS, LEAST_SCATTER_MPS = 8, 0.45, 6.0, 0.03
-# Half-width of the difference for the DVL's acceleration: s, and intervals of the DVL.
-SLOPE_REACH_S, SLOPE_INTERVALS = 0.5, 2.0
+# Half-width of the difference for the DVL's acceleration, and bins of dense references: s, and intervals of the DVL.
+SPAN_S, SPAN_INTERVALS = 0.5, 2.0
 # Blocks that are predicted at once: more do not fit the processor's caches.
 AT_ONCE = 16
 # Longest gap of the DVL that is interpolated: the larger of this number of its usual intervals and this time, s.
@@ -77,20 +73,6 @@ class FitBlock:
         return self
 
     @cached_property
-    def suspicious(self) -> Index:
-        """Indices of samples of a slow DVL that deviate from interpolation, more than their neighbours do."""
-        if self.interval_s < SLOW_S or len(self.dvl.times) < FEWEST_DVL:
-            return np.zeros(0, dtype=np.intp)
-        off = deviation_from_neighbours(self.dvl.velocity)
-        far = (np.abs(off) / np.maximum(robust_std(off), LEAST_SCATTER_MPS)).max(axis=1)
-        return np.flatnonzero((far > SUSPICIOUS) & (far >= neighbours(far)))
-
-    def without(self, places: Index) -> FitBlock:
-        """Return the block without some DVL samples."""
-        dvl = DvlColumns(*(np.delete(column, places, axis=0) for column in self.dvl))
-        return replace(self, dvl=dvl, slope=spline_slopes(*dvl))
-
-    @cached_property
     def is_comparable(self) -> bool:
         """Whether it has references, and enough samples to interpolate at."""
         return len(self.dvl.times) >= 4 and len(self.imu.times) >= 2 and len(self.reference.times) > 0
@@ -98,7 +80,7 @@ class FitBlock:
     @cached_property
     def slope_reach_s(self) -> float:
         """Half-width (s) of the difference for the DVL's acceleration; over less, its noise dominates."""
-        return max(SLOPE_REACH_S, SLOPE_INTERVALS * self.interval_s)
+        return max(SPAN_S, SPAN_INTERVALS * self.interval_s)
 
     @cached_property
     def slope_variance(self) -> float:

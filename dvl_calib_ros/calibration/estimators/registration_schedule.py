@@ -30,15 +30,14 @@ from ..results.thinned_recording import (
     typical_error,
 )
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
-from .estimator import Rest
-from .full_fit import JointFit
+from .estimator import Residuals
+from .full_fit import KEPT_BLOCKS, JointFit
 from .full_forward_model import deviation_of
 
 # Live, registration is repeated once the number of blocks has grown by this factor.
 AGAIN_FROM = 1.5
-# Blocks needed for a registration, blocks before the first live one (a minute), and blocks kept (40 minutes):
-# registration uses at most the rows of a third of them, and a node's memory must not grow.
-ENOUGH, FIRST_LOOK, MOST = 2, 6, 240
+# Blocks needed for a registration, and before the first live one (a minute).
+ENOUGH, FIRST_LOOK = 2, 6
 # Rows of each stream in a 10 s block.
 MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 
@@ -85,10 +84,10 @@ class _Registered:
     def take_room(self) -> None:
         """Reserve the final size now, so that memory does not grow for 40 minutes."""
         for stream in self._streams:
-            stream.reserve((MOST + 1) * MOST_OF_A_BLOCK)
+            stream.reserve((KEPT_BLOCKS + 1) * MOST_OF_A_BLOCK)
 
     def add(self, kept: ThinnedBlock) -> None:
-        """Add a block, and drop the oldest beyond `MOST`."""
+        """Add a block, and drop the oldest beyond `KEPT_BLOCKS`."""
         r = kept.reference
         variance = np.diagonal(r.noise, axis1=1, axis2=2)
         own_noise = np.full(len(kept.dvl.times), np.trace(kept.noise_dvl))
@@ -98,7 +97,7 @@ class _Registered:
             for name, values in zip(stream.LAYOUT, own, strict=True):
                 getattr(stream, name)[at] = values
         self._blocks.append(tuple(len(own[0]) for own in columns))
-        if len(self._blocks) > MOST:
+        if len(self._blocks) > KEPT_BLOCKS:
             for stream, n in zip(self._streams, self._blocks.popleft(), strict=True):
                 stream.forget_before(stream.begin + n)
 
@@ -147,7 +146,7 @@ class Looked(NamedTuple):
     blocks: int = 0
     registration: Registration | None = None
     configuration: Reason | None = None
-    rest: Rest | None = None
+    residuals: Residuals | None = None
 
 
 class KeptClocks:
@@ -207,19 +206,19 @@ class KeptClocks:
         try:
             found = register(motion, nominal, lever_arm)
             configuration = fitting_configuration(motion, declared, found, self._parameters)
-            rest = self._rest(fit_so_far) if self._is_live and fit_so_far is not None else None
-            return Looked(self._blocks, found, configuration, rest)
+            residuals = self._residuals(fit_so_far) if self._is_live and fit_so_far is not None else None
+            return Looked(self._blocks, found, configuration, residuals)
         except np.linalg.LinAlgError:  # the fit diverged
             return Looked(self._blocks)
 
-    def _rest(self, fit_so_far: FitSoFar) -> Rest:
+    def _residuals(self, fit_so_far: FitSoFar) -> Residuals:
         """Return the residuals of all kept blocks, each corrected by the fit without its fold."""
         recording, p = self._seen.recording(), self._parameters
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + fit_so_far.epoch_ns
         without = [[states[-1]] for states in fit_so_far.fit.without_folds()]
         state = fit_so_far.fit.states[-1]
         terms = [Terms.of_state(state.x) for [state] in without]
-        return Rest(
+        return Residuals(
             fit_so_far.fit.held_out_error(),
             typical_error(recording, Terms.of_state(state.x), p),
             recording.judged(p),

@@ -9,14 +9,12 @@ from collections.abc import Callable
 import numpy as np
 
 from ..models.own import BIAS
+from ..numerics.block_covariance import BLOCK_S
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from .full_forward_model import FitBlock, PredictedRows
+from .full_forward_model import SPAN_S, FitBlock, PredictedRows
 from .slow_errors import WIDTH, Bins, Chain, SlowErrors, binned_rows, gram_of
 
-# Interval between knots of the slow errors, and length of bins of rows, s. A bin holds at least BIN_INTERVALS DVL
-# intervals.
-SECTION_S, BIN_S, BIN_INTERVALS = 10.0, 0.5, 2.0
 DENSER = 0.7  # references are denser than the DVL below this ratio of intervals
 # Squared residual of three axes, in variances, that 1 % of good rows exceed. Beyond it a row has weight gate / misfit.
 GATE = 11.3
@@ -67,7 +65,7 @@ class SectionRows:
         assert self.rows is not None
         if self._bins is None:
             weight = np.minimum(1.0, GATE / np.maximum(self.misfit(single), 1e-9))
-            self._bins = binned_rows(self.rows, weight, self.from_s, self.from_s + SECTION_S, self._bin_s)
+            self._bins = binned_rows(self.rows, weight, self.from_s, self.from_s + BLOCK_S, self._bin_s)
         return self._bins
 
 
@@ -81,7 +79,7 @@ def effects_gram(
     bins = part.with_effects(velocities).bins(single)
     k = bins.rows.shape[2] - WIDTH
     gram = gram_of(bins, white, np.append(x, np.zeros(k)), part.slope_variance)
-    found: Array = Chain.begun(slow, k).after(gram, SECTION_S, slow).ended().gram[0]
+    found: Array = Chain.begun(slow, k).after(gram, BLOCK_S, slow).ended().gram[0]
     return found
 
 
@@ -108,11 +106,11 @@ def _bin_length_s(block: FitBlock) -> float:
     """Return the bin length, s: longer where references are denser than DVL samples, because they then share these."""
     times = block.reference.times
     if len(times) < 2 or len(block.dvl.times) < 2:
-        return BIN_S
+        return SPAN_S
     apart = (times[-1] - times[0]) / (len(times) - 1)
-    return max(BIN_S, BIN_INTERVALS * block.interval_s) if apart < DENSER * block.interval_s else BIN_S
+    return block.slope_reach_s if apart < DENSER * block.interval_s else SPAN_S
 
 
 def section_starts(block: FitBlock) -> list[float]:
     """Return where the sections of a block begin, s."""
-    return [block.from_s + SECTION_S * n for n in range(round((block.end_s - block.from_s) / SECTION_S))]
+    return [block.from_s + BLOCK_S * n for n in range(round((block.end_s - block.from_s) / BLOCK_S))]

@@ -28,7 +28,6 @@ NOISE_TWICE = 2.0
 # Smallest share of signal in the acceleration column; with less it is not used. Gauss-Newton steps are too long by 1 /
 # √share.
 LEAST_SHARE = 0.4
-DEG = math.pi / 180.0
 
 
 class SlowErrors(NamedTuple):
@@ -64,8 +63,8 @@ class Priors:
 
     horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
     vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
-    heading: LogNormal = field(default_factory=lambda: LogNormal(0.21 * DEG, 1.7))
-    tilt: float = 0.1 * DEG
+    heading: LogNormal = field(default_factory=lambda: LogNormal(math.radians(0.21), 1.7))
+    tilt: float = math.radians(0.1)
     memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
     deviation: LogNormal = field(default_factory=lambda: LogNormal(0.3, 3.0))
 
@@ -105,8 +104,8 @@ def binned_rows(rows: PredictedRows, row_weight: Array, from_s: float, end_s: fl
     both = np.concatenate([rows.columns, rows.residual[:, :, None]], axis=2)
     mean = np.add.reduceat(both * share[:, :, None], first)
     slow = np.add.reduceat(rows.slow * share[:, :, None], first)
-    along = np.add.reduceat((rows.times[:, None] - from_s) / (end_s - from_s) * share, first)[:, :, None]
-    whole = np.concatenate([(1.0 - along) * slow, along * slow, mean], axis=2)
+    fraction = np.add.reduceat((rows.times[:, None] - from_s) / (end_s - from_s) * share, first)[:, :, None]
+    whole = np.concatenate([(1.0 - fraction) * slow, fraction * slow, mean], axis=2)
     return Bins(whole, total, rows.fold[first])
 
 

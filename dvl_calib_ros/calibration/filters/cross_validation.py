@@ -21,6 +21,7 @@ from ..models.parameters import Parameters
 from ..numerics.error_model import CORRECTION_JACOBIAN, correction_matrix
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState, Measurements
+from ..numerics.robust import FEWEST_SAMPLES
 from ..numerics.samples import Stamps
 
 FOLDS = 5
@@ -105,8 +106,8 @@ class FoldInformation:
             some = rows.take(at, axis=3)
             weighted = some * weight[:, None, None, at]
             flat = (*some.shape[:2], -1)
-            told = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
-            self._told.add(fold, told[..., :-1, :-1], told[..., :-1, -1])
+            added = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
+            self._told.add(fold, added[..., :-1, :-1], added[..., :-1, -1])
 
     def without(self, fold: int) -> tuple[Array, Array]:
         """Return Λ (K, n, n) and Λx (K, n) without a fold."""
@@ -182,10 +183,6 @@ class Moments(FoldSums):
         return float(gg - 2.0 * np.sum(c * gv) + np.einsum("ai,aij,aj->", c, vv, c))
 
 
-# Fewest samples with a reference for a verification.
-ENOUGH_SAMPLES = 20
-
-
 @dataclass(frozen=True)
 class HeldOutError:
     """Velocity error against the reference on held-out samples, m/s rms over the vector.
@@ -216,7 +213,7 @@ def held_out_error(
     without: one state for each fold.
     """
     samples = int(moments.total[0])
-    if samples < ENOUGH_SAMPLES or max(moments.of(fold)[0] for fold in range(FOLDS)) == samples:
+    if samples < FEWEST_SAMPLES or max(moments.of(fold)[0] for fold in range(FOLDS)) == samples:
         return None
     nominal = rotation_dvl_from_body.T
     uncorrected = corrected = noise = calibration = 0.0
@@ -246,7 +243,7 @@ def calibration_error(
 
 def held_out_from_sums(samples: int, sums: Sequence[float] | Array) -> HeldOutError | None:
     """Return the error from sums of squares (m/s)² in the order of `HeldOutError`; None for too few samples."""
-    if samples < ENOUGH_SAMPLES:
+    if samples < FEWEST_SAMPLES:
         return None
     return HeldOutError(samples, *(math.sqrt(max(float(total), 0.0) / samples) for total in sums))
 

@@ -18,13 +18,13 @@ from ..models import Model, Needs
 from ..models.base import Observations
 from ..models.parameters import Parameters
 from ..numerics import kalman
-from ..numerics.block_covariance import TimeBlocks
+from ..numerics.block_covariance import BLOCK_NS, TimeBlocks
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Mask, Stamps
 from .cross_validation import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .filter_setup import Assembler
-from .state_history import Counts, Standing
+from .state_history import Counts, Snapshot
 
 # Memory of the integral, s: a pitch error of 3 degrees adds 10 m at 2 m/s, which looks like a constant current.
 MEMORY_S = 100.0
@@ -45,10 +45,10 @@ class RelativeHeight:
         heights = np.empty(len(rising))
         for row, (stamp_ns, speed) in enumerate(zip(stamps_ns.tolist(), rising.tolist(), strict=True)):
             step_s = 0.0 if last_ns is None else 1e-9 * (stamp_ns - last_ns)
-            left = math.exp(-step_s / MEMORY_S)
-            height *= left
+            decay = math.exp(-step_s / MEMORY_S)
+            height *= decay
             if step_s <= LONGEST_STEP_S:
-                height += speed * MEMORY_S * (1.0 - left)
+                height += speed * MEMORY_S * (1.0 - decay)
             heights[row] = height
             last_ns = stamp_ns
         self._height, self._last_ns = height, last_ns
@@ -60,8 +60,6 @@ class RelativeHeight:
 
 
 Ends = Index
-# Time blocks for the scatter of σ, ns: as long as the correlation of vehicle motion.
-BLOCK_NS = 10_000_000_000
 
 # Number of samples from which the vectorised batch is faster than the recursion.
 BATCH_FROM = 24
@@ -137,7 +135,7 @@ class Group:
 
     def update(
         self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
-    ) -> Standing | None:
+    ) -> Snapshot | None:
         """Update by a block of N samples that meet the needs. Return the states after `ends` samples (E), if given.
 
         weight, prior_known: (N,) as in `Assembler.measurements`.
@@ -164,7 +162,7 @@ class Group:
             self._folds.add(folds, data, after.used)
             if self.needs is Needs.REFERENCE:
                 self.moments.take(folds, seen)
-        standing = None if ends is None or every is None else self._standing_at(after, ends, every)
+        snapshot = None if ends is None or every is None else self._snapshot_at(after, ends, every)
         n_used = after.used.sum(axis=1)
         self._used += n_used
         self._gated += data.usable.sum(axis=1) - n_used
@@ -173,7 +171,7 @@ class Group:
             self._rows_sum += n_used * data.z.shape[2]
         else:
             self._rows_sum += (after.used * self._assembler.rows_left(seen.unmeasured)).sum(axis=1)
-        return standing
+        return snapshot
 
     def end_day(self) -> None:
         """Keep the states of the vehicle for the next recording, and reset those that differ per recording."""
@@ -220,21 +218,22 @@ class Group:
         at = None if ends is None else GaussianState(np.stack([x] * len(ends)), np.stack([p] * len(ends)))
         return kalman.Updated(x, p, nothing, nothing.astype(float), at)
 
-    def _standing_at(self, after: kalman.Updated, ends: Ends, every: Ends) -> Standing:
+    def _snapshot_at(self, after: kalman.Updated, ends: Ends, every: Ends) -> Snapshot:
         """Return the states after `ends` samples. every: sample numbers with known states."""
         states = after.at
         assert states is not None
         at = np.searchsorted(every, ends)
         used = np.cumsum(np.pad(after.used, ((0, 0), (1, 0))), axis=1)[:, ends].T
         nis = np.cumsum(np.pad(np.where(after.used, after.nis, 0.0), ((0, 0), (1, 0))), axis=1)[:, ends].T
-        return Standing(states.x[at], states.p[at], self._used + used, self._nis_sum + nis)
+        return Snapshot(states.x[at], states.p[at], self._used + used, self._nis_sum + nis)
 
-    def standing(self, n: int) -> Standing:
+    def snapshot(self, n: int) -> Snapshot:
         """Return the present states, n times."""
-        now = Standing(self._x[None], self._p[None], self._used[None], self._nis_sum[None])
-        return Standing.joined([now] * n)
+        now = Snapshot(self._x[None], self._p[None], self._used[None], self._nis_sum[None])
+        return Snapshot.joined([now] * n)
 
     def _process_noise(self, stamps_ns: Stamps) -> Array | None:
+        """Return the process noise added before each sample, None without any."""
         rate = self._assembler.process_rate
         if rate is None:
             return None
@@ -257,15 +256,15 @@ class Group:
             self._of_recording[name] = self.state(name).raised(self._scatter.inflation(self.index[name]))
         return self._of_recording[name]
 
-    def counts_at(self, name: str, standing: Standing) -> tuple[Counts, Array]:
+    def counts_at(self, name: str, snapshot: Snapshot) -> tuple[Counts, Array]:
         """Return the samples used by one model (E,) and the sum of νᵀS⁻¹ν over them (E,)."""
         index = self.index[name]
-        return standing.used[:, index], standing.nis_sum[:, index]
+        return snapshot.used[:, index], snapshot.nis_sum[:, index]
 
-    def states_at(self, name: str, standing: Standing) -> GaussianState:
+    def states_at(self, name: str, snapshot: Snapshot) -> GaussianState:
         """Return states x (E, n) and covariances P (E, n, n) of one model."""
         index = self.index[name]
-        return self._assembler.state(index, standing.x[:, index], standing.p[:, index])
+        return self._assembler.state(index, snapshot.x[:, index], snapshot.p[:, index])
 
     def states_without_folds(self, name: str) -> list[GaussianState]:
         """Return state and covariance of one model without each fold."""
@@ -300,6 +299,7 @@ def _joined_ends(cuts: Ends, ends: Ends | None) -> Ends | None:
 def _filtered(
     x: Array, p: Array, data: kalman.Measurements, process: Array | None, ends: Ends | None
 ) -> kalman.Updated:
+    """Filter the samples, in a batch if there are enough and no process noise."""
     if process is None and data.z.shape[1] >= BATCH_FROM:
         return kalman.batch(x, p, data, ends)
     return kalman.recursion(x, p, data, process, ends)

@@ -16,7 +16,7 @@ Numbers = NDArray[np.int64]
 Counts = NDArray[np.int64]
 
 
-class Standing(NamedTuple):
+class Snapshot(NamedTuple):
     """K models after E rows: x (E, K, n), P (E, K, n, n) of the filter; used, nis_sum (E, K) so far."""
 
     x: Array
@@ -24,16 +24,16 @@ class Standing(NamedTuple):
     used: Counts
     nis_sum: Array
 
-    def row(self, index: int) -> Standing:
+    def row(self, index: int) -> Snapshot:
         """Return one row, as E = 1."""
         at = slice(index, index + 1)
-        return Standing(self.x[at], self.p[at], self.used[at], self.nis_sum[at])
+        return Snapshot(self.x[at], self.p[at], self.used[at], self.nis_sum[at])
 
     @staticmethod
-    def joined(rows: Sequence[Standing]) -> Standing:
+    def joined(rows: Sequence[Snapshot]) -> Snapshot:
         """Return concatenated rows."""
         x, p, used, nis_sum = zip(*rows, strict=True)
-        return Standing(np.concatenate(x), np.concatenate(p), np.concatenate(used), np.concatenate(nis_sum))
+        return Snapshot(np.concatenate(x), np.concatenate(p), np.concatenate(used), np.concatenate(nis_sum))
 
 
 class StateTrace:
@@ -50,13 +50,13 @@ class StateTrace:
     def start(self, groups: Iterable[Hashable]) -> None:
         """Restart with these groups of models."""
         self._stride = max(1, -(-self._expected // self._limit))
-        self._kept: dict[Hashable, dict[int, Standing]] = {group: {} for group in groups}
+        self._kept: dict[Hashable, dict[int, Snapshot]] = {group: {} for group in groups}
 
     def wanted(self, first: int, end: int) -> Numbers:
         """Return the rows among first .. end - 1 after which states are stored."""
         return np.arange(-(-first // self._stride) * self._stride, end, self._stride)
 
-    def add(self, numbers: Numbers, group: Hashable, after: Standing) -> None:
+    def add(self, numbers: Numbers, group: Hashable, after: Snapshot) -> None:
         """Add the states of a group after rows (E)."""
         kept = self._kept[group]
         for index, number in enumerate(numbers.tolist()):
@@ -72,6 +72,6 @@ class StateTrace:
         common = set.intersection(*(set(each) for each in self._kept.values()))
         return np.array(sorted(number for number in common if number % self._stride == 0), dtype=np.int64)
 
-    def standing(self, group: Hashable, numbers: Numbers) -> Standing:
+    def snapshot(self, group: Hashable, numbers: Numbers) -> Snapshot:
         """Return the states of a group after these rows."""
-        return Standing.joined([self._kept[group][number] for number in numbers.tolist()])
+        return Snapshot.joined([self._kept[group][number] for number in numbers.tolist()])

@@ -38,15 +38,15 @@ class Needs(Enum):
 class Nuisance(NamedTuple):
     """State that is estimated only to keep its effect out of misalignment and scale.
 
-    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. of_the_day: the value
-    differs per recording. handed_on: a result file passes it on as a prior, even if it differs per recording, because a
-    restarted node usually continues the same recording.
+    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. per_recording: the
+    value differs per recording. handed_on: a result file passes it on as a prior, even if it differs per recording,
+    because a restarted node usually continues the same recording.
     """
 
     name: str
     unit: str
     std: float | str
-    of_the_day: bool = False
+    per_recording: bool = False
     handed_on: bool = True
 
 
@@ -108,8 +108,8 @@ class Model:
 
     @cached_property
     def of_day(self) -> NDArray[np.intp]:
-        """Indices (u,) of the states that differ per recording (`Nuisance.of_the_day`)."""
-        return self._nuisance_that(lambda each: each.of_the_day)
+        """Indices (u,) of the states that differ per recording (`Nuisance.per_recording`)."""
+        return self._nuisance_that(lambda each: each.per_recording)
 
     @cached_property
     def not_handed_on(self) -> NDArray[np.intp]:
@@ -229,6 +229,7 @@ class Observations:
         return self._reference(self.reference_body * _HORIZONTAL)
 
     def _reference(self, velocity_body: Array) -> Reference:
+        """Return the reference velocity (N, 3) m/s at the DVL in its frame, and its cross-product matrices."""
         if self.lever_velocity is not None:
             velocity_body = velocity_body + self.lever_velocity
         r = velocity_body @ self.rotation_dvl_from_body.T

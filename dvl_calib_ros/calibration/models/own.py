@@ -55,6 +55,7 @@ def _unaided(seen: Observations) -> Linearised:
 
 
 def _unaided_noise(seen: Observations) -> Array:
+    """Return R (N, 3, 3) (m/s)² of `unaided`: sway and heave grow with the turn rate."""
     assert seen.angular_velocity is not None and seen.oriented is not None
     turn = seen.angular_velocity[:, 2] * seen.velocity_in_body[:, 0]
     noise = np.zeros((len(turn), 3, 3))
@@ -76,14 +77,14 @@ UNAIDED = Model(
     wrong_when="a current that changes along the run or, on one heading, exceeds current_std; without attitude, a run "
     "that is mostly turning",
     nuisance=(
-        Nuisance("current_east", "m/s", "current_std", of_the_day=True),
-        Nuisance("current_north", "m/s", "current_std", of_the_day=True),
+        Nuisance("current_east", "m/s", "current_std", per_recording=True),
+        Nuisance("current_north", "m/s", "current_std", per_recording=True),
         Nuisance("skid", "s", 3.0),
         Nuisance("dive", "", 0.5),
         Nuisance("heave", "m/s", "heave_offset_std"),
-        Nuisance("shear_east", "1/s", SHEAR_STD, of_the_day=True),
-        Nuisance("shear_north", "1/s", SHEAR_STD, of_the_day=True),
-        Nuisance("sway", "m/s", "current_std", of_the_day=True),
+        Nuisance("shear_east", "1/s", SHEAR_STD, per_recording=True),
+        Nuisance("shear_north", "1/s", SHEAR_STD, per_recording=True),
+        Nuisance("sway", "m/s", "current_std", per_recording=True),
     ),
     sideslip_std=SIDESLIP_STD,
     uses_height=True,
@@ -151,11 +152,11 @@ FULL = Model(
         Nuisance("heading_cos", "rad", "heading_deviation_std"),
         Nuisance("heading_sin2", "rad", "heading_deviation_std"),
         Nuisance("heading_cos2", "rad", "heading_deviation_std"),
-        Nuisance("time_offset", "s", "initial_std_time_offset", of_the_day=True),
-        Nuisance("reference_time_offset", "s", REFERENCE_DELAY_STD_S, of_the_day=True, handed_on=False),
-        Nuisance("reference_east", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
-        Nuisance("reference_north", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
-        Nuisance("reference_up", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
+        Nuisance("time_offset", "s", "initial_std_time_offset", per_recording=True),
+        Nuisance("reference_time_offset", "s", REFERENCE_DELAY_STD_S, per_recording=True, handed_on=False),
+        Nuisance("reference_east", "m/s", "reference_offset_std", per_recording=True, handed_on=False),
+        Nuisance("reference_north", "m/s", "reference_offset_std", per_recording=True, handed_on=False),
+        Nuisance("reference_up", "m/s", "reference_offset_std", per_recording=True, handed_on=False),
     ),
     noise=lambda seen: seen.noise_in_body,
     estimator="dvl_calib_ros.calibration.estimators.block_estimator:FullEstimator",

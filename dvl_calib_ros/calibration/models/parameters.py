@@ -68,6 +68,7 @@ class ParameterSpec:
         return value
 
     def _number(self, name: str, value: Any) -> float:
+        """Return a value as a float within the limits. Raises ParameterError."""
         if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             raise ParameterError(f"{name}: expected a number, got {value!r}")
         try:

@@ -45,6 +45,7 @@ def load(name: str) -> object:
 
 
 def _loaded(name: str, value: str, known: Mapping[str, Model]) -> dict[str, Model]:
+    """Return the model of an entry point by its name. Raises InputError for any fault of its package."""
     try:
         model = load(value)
         if not isinstance(model, Model):

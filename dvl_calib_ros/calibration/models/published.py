@@ -56,6 +56,7 @@ def _aided(
     assumes: str,
     wrong_when: str,
 ) -> Model:
+    """Return a model with a reference velocity: misalignment, and one scale state per entry of scale_axes."""
     return Model(
         name,
         Needs.REFERENCE,

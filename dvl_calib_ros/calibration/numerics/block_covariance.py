@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from .frames import Array
 from .tests import chi2_isf
 
+# Length of a block of time: motion and the errors of waves are correlated over less.
+BLOCK_S, BLOCK_NS = 10.0, 10_000_000_000
 # Most blocks. When full, neighbours are joined and the block length doubles: memory is bounded, and the scatter covers
 # effects of minutes.
 MOST = 64
@@ -91,9 +93,9 @@ class TimeBlocks:
         onto[:, of_day] = 0.0
         found = (within @ vector[:, of_day, None])[..., 0]
         for told, y in zip(*self.kept, strict=True):
-            rest = y - (told[:, :, of_day] @ found[..., None])[..., 0]
+            residual = y - (told[:, :, of_day] @ found[..., None])[..., 0]
             told[:] = onto @ told @ onto.swapaxes(1, 2)
-            y[:] = (onto @ rest[..., None])[..., 0]
+            y[:] = (onto @ residual[..., None])[..., 0]
         self.choose(source)
 
     def choose(self, source: NDArray[np.intp]) -> None:

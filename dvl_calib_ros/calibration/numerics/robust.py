@@ -11,6 +11,14 @@ from .frames import Array
 # Median absolute deviation of a normal variable, in standard deviations.
 MEDIAN_DISTANCE = NormalDist().inv_cdf(0.75)
 MEDIAN_SQUARE = MEDIAN_DISTANCE**2
+# Noise below this is rounding, and the smallest noise of a real instrument, m/s.
+ROUNDING_MPS, QUIETEST_MPS = 1e-4, 1e-3
+# Fewest independent values (stretches, fixes, slow samples) of a scatter: σ from 12 values is known to a fifth.
+FEWEST_VALUES = 12
+# Passes of a robust fit, each with the weights or outliers of the last one.
+ROBUST_PASSES = 3
+# Fewest samples of one motion, which are partly correlated: of a fit or of a share, and of a direction or a rate.
+FEWEST_SAMPLES, FEWEST_OF_MOTION = 20, 60
 
 
 def median(values: Array) -> Array:

@@ -70,6 +70,7 @@ class RowTable:
                 getattr(self, name)[held:] = 0
 
     def _make_room(self, n: int) -> None:
+        """Double the capacity until n more rows fit."""
         capacity = self._capacity
         while self.size - self.begin + n > FULL * capacity:
             capacity *= 2

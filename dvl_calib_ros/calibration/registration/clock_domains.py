@@ -69,11 +69,7 @@ def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, late_s
     ]
 
 
-SPOKEN: Mapping[Stream, str] = {
-    Stream.DVL: "the DVL's",
-    Stream.REFERENCE: "the reference's",
-    Stream.IMU: "the IMU's",
-}
+SPOKEN: Mapping[Stream, str] = {Stream.DVL: "the DVL's", Stream.REFERENCE: "the reference's", Stream.IMU: "the IMU's"}
 # Offsets of known time scales from UTC, in whole seconds (since 2017).
 WELL_KNOWN = {18: "GPS time, without its leap seconds, is 18 s ahead of UTC", 37: "TAI is 37 s ahead of UTC"}
 
@@ -125,6 +121,7 @@ class StreamClocks:
         return self._cached[1]
 
     def _objections(self, parameters: Parameters) -> list[Reason]:
+        """Return a finding for each clock offset beyond `LARGEST_S`, from the order of arrival."""
         ahead = {Stream.DVL: 0.0}
         for stream, spread in self._ahead.items():
             self._add_waiting(stream)

@@ -25,9 +25,12 @@ from .motion_streams import MotionStreams
 DIRECTIONS: Mapping[str, tuple[float, float]] = {"dvl": (1.0, 0.0), "reference": (-1.0, 1.0), "imu": (0.0, -1.0)}
 # σ of the changes of interpolation and filter delays between stretches, s.
 LAGS_S = 0.03
-# Thresholds of a clock change from end to end: seconds, chi-square gain, and largest residual chi-square per degree of
-# freedom.
-SHOWN_FROM_S, GAIN, LEFT = 0.1, 18.0, 4.0
+# Smallest delay, change of it from end to end, or difference of two estimates of it that is reported, s. It shifts a
+# lever arm by a tenth of a second times the speed. Interpolated attitudes and the filters of an INS have smaller delays
+# (five real recordings: 0.03 to 0.07 s).
+REPORTED_FROM_S = 0.1
+# Thresholds of a clock change: chi-square gain, and largest residual chi-square per degree of freedom.
+GAIN, LEFT = 18.0, 4.0
 # Smallest gap in the stamps as a share of the forward step that caused it.
 HOLE = 0.8
 # Limits of the parameters `dvl_clock_drift`, s/s, and `dvl_time_jump`, s.
@@ -142,10 +145,10 @@ def _reach(times: Array) -> float:
     return float(np.ptp(times)) / MOST_STRETCHES + STRETCH_S
 
 
-def _holes(times: Array, leap: float, at: float, reach: float) -> Index:
+def _holes(times: Array, jump: float, at: float, reach: float) -> Index:
     """Return indices of times (N,) before gaps of the size of a step (s), within reach of it."""
     gap = np.diff(times)
-    return np.flatnonzero((gap > HOLE * leap) & (np.abs(times[1:] - at) < reach + gap))
+    return np.flatnonzero((gap > HOLE * jump) & (np.abs(times[1:] - at) < reach + gap))
 
 
 def unsteady(
@@ -185,7 +188,8 @@ def unsteady(
     # noise as long as a stretch adds scatter, so all evidence is scaled down
     scatter = max(1.0, left / (seen.size - len(states) - 1.0))
     std *= math.sqrt(scatter)
-    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > Z_SLOW_ERRORS * std
+    is_large = abs(value) * length > REPORTED_FROM_S and abs(value) > Z_SLOW_ERRORS * std
+    is_shown = is_large and still - left > GAIN * scatter
     if not is_shown or left > min(but_one) + ANYTHING * scatter or scatter > LEFT:
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)
@@ -212,6 +216,6 @@ def _explained(seen: Array, weight: Array, moved: Array, kept: Mask) -> tuple[fl
     n = k + is_asked
     p = np.linalg.inv(information[:n, :n])
     x = p @ np.einsum("sij,sik,sk->j", h, w, z)[:n]
-    rest = z - h[:, :, :n] @ x
-    left = float(np.einsum("si,sij,sj->", rest, w, rest))
-    return (left, float(x[k]), float(np.sqrt(p[k, k]))) if is_asked else (left, 0.0, np.inf)
+    residual = z - h[:, :, :n] @ x
+    chi_square = float(np.einsum("si,sij,sj->", residual, w, residual))
+    return (chi_square, float(x[k]), float(np.sqrt(p[k, k]))) if is_asked else (chi_square, 0.0, np.inf)

@@ -15,21 +15,21 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import FLU, FRD, IMU_ENU, IMU_NED, Parameters, rpy_text
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
+from ..numerics.robust import FEWEST_OF_MOTION
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
-from ..streams.interpolation import attitude_at
+from ..streams.interpolation import GAP_S, attitude_at
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
-from .motion_streams import GAP_S, Curves, MotionStreams
+from .motion_streams import Curves, MotionStreams
 from .registration import GAIN, INDEPENDENT_S, Registration
+from .unregistrable_clocks import MOVING_MPS
 
 # Detection of velocities in an earth frame: their direction rotates with the heading.
 # In its own axes a vehicle moves in much the same direction on every heading. DVL velocities that a driver rotated
 # into the earth frame agree with an earth-frame reference without residual, so only the heading reveals them.
 
-# Fewest samples, and lowest speed (m/s), that determine a direction.
-ENOUGH, SLOW = 60, 0.2
-# Mean resultant lengths: above ONE directions agree; below SEVERAL headings differ (25° about their mean).
-ONE, SEVERAL = 0.9, 0.9
+# Mean resultant length: directions agree above, and headings differ below (25° about their mean).
+ALIKE = 0.9
 # Largest ratio of the spread in the earth frame to the spread in the body frame for earth-frame velocities.
 CLEARLY = 0.25
 
@@ -45,7 +45,7 @@ class Directions:
         """Add velocities (N, 3) m/s, nominally in the body frame, and their attitudes (N, 3, 3)."""
         along = velocity[:, 0] + 1j * velocity[:, 1]
         ahead = rotation_enu_from_body[:, 0, 0] + 1j * rotation_enu_from_body[:, 1, 0]
-        use = (np.abs(along) > SLOW) & (np.abs(ahead) > 0.5)
+        use = (np.abs(along) > MOVING_MPS) & (np.abs(ahead) > 0.5)
         along, ahead = along[use] / np.abs(along[use]), ahead[use] / np.abs(ahead[use])
         self._n += len(along)
         self._body += complex(along.sum())
@@ -54,7 +54,7 @@ class Directions:
         self._heading += complex(ahead.sum())
 
     def _length(self, total: complex) -> float:
-        return abs(total) / self._n if self._n >= ENOUGH else math.nan
+        return abs(total) / self._n if self._n >= FEWEST_OF_MOTION else math.nan
 
     @property
     def turn_with_heading(self) -> bool:
@@ -63,22 +63,20 @@ class Directions:
         NED needs several headings: a vehicle that yaws in waves on a straight course looks like NED.
         """
         of_body, of_enu, of_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
-        if of_enu < 1.0 - ONE and of_enu < CLEARLY * of_body:
+        if of_enu < 1.0 - ALIKE and of_enu < CLEARLY * of_body:
             return True
-        return self._headings_are_several and of_ned < 1.0 - ONE and of_ned < CLEARLY * of_body
+        return self._headings_are_several and of_ned < 1.0 - ALIKE and of_ned < CLEARLY * of_body
 
     @property
     def stay_in_the_body(self) -> bool:
         """True if the velocity direction is constant in the body over several headings."""
-        return self._headings_are_several and self._length(self._body) > ONE
+        return self._headings_are_several and self._length(self._body) > ALIKE
 
     @property
     def _headings_are_several(self) -> bool:
-        return self._length(self._heading) < SEVERAL
+        return self._length(self._heading) < ALIKE
 
 
-# Misfit, as a share of the speed, from which a configuration is wrong: that of 10 degrees.
-WRONG_FROM = math.sin(math.radians(10.0))
 # Largest misfit of a reported configuration, as a share of the speed and of the misfit of the configured one.
 FITS_BELOW, BETTER_BY = math.sqrt(0.05), 0.5
 # Rotations nearer than this are the same but for a misalignment, rad.
@@ -94,8 +92,9 @@ SIGNS_OF_AHEAD: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # Smallest excess factor of one axis, above any error of the speed of sound.
 SCALED_ALONE = 0.2
-# Largest misalignment (rad) and scale error of a right configuration.
+# Largest misalignment (rad) and scale error of a right configuration; a misfit (share of the speed) as large is wrong.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
+WRONG_FROM = math.sin(MISALIGNED)
 # Initial DVL delays, s: the range of a calibration, in steps that are short compared to waves.
 DELAYS_S = (0.0, -1.2, 1.2, -2.4, 2.4)
 # A fit that hardly improves is given up above this multiple of the largest useful residual.
@@ -161,10 +160,7 @@ def fitting_configuration(
 
 
 def nearest(
-    fit: MotionFit,
-    rotation_body_from_dvl: Array | None,
-    held: Sequence[Array] = WITHOUT_ARM,
-    most: float = math.inf,
+    fit: MotionFit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM, most: float = math.inf
 ) -> Fitted | None:
     """Return the best fit over the DVL delays that a calibration covers, or None.
 
@@ -237,10 +233,12 @@ def wrong_axes(
     _, signs, near = min(found, key=lambda each: each[0])
     fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
     fitted = fit(0.0, near.dvl_delay_s, nominal, (REFERENCE,))
-    if fitted is None or fitted.level > most:
+    if fitted is None:
         return None
-    factors, std = fit.axis_factors(fitted, nominal)
+    factors, std, level = fit.axis_factors(fitted, nominal)
     is_shown, is_turned = factors > Z_REPEATED_TEST * std, signs < 0.0
+    if (fitted.level if is_turned.any() else level) > most:
+        return None
     if is_turned[ahead]:  # a mounting unless all signs are observable
         axis = "each of x, y and z" if is_turned.all() else "xyz"[ahead]
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None

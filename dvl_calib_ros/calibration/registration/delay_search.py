@@ -14,7 +14,7 @@ import numpy as np
 
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from ..streams.interpolation import attitude_at
+from ..streams.interpolation import REACH_INTERVALS, attitude_at
 from .motion_streams import MotionStreams
 
 # Largest searched delay, s.
@@ -22,8 +22,8 @@ LONGEST_S = 60.0
 # Grid steps of short and long recordings, s, most steps of a short one, and most grid points: memory and time are
 # bounded, and turns of a vehicle last longer than a step.
 STEP_S, LONG_STEP_S, MANY, MOST = 0.5, 1.0, 500, 7200
-# Gaps longer than both this multiple of the sample interval and this time (s) are not interpolated.
-HOLE_INTERVALS, HOLE_S = 2.6, 2.5
+# Gaps longer than both `REACH_INTERVALS` and this time (s) are not interpolated.
+HOLE_S = 2.5
 # Smallest overlap: share of the shorter stream, and seconds.
 OVERLAP, SHORTEST_S = 0.4, 20.0
 # Smallest distance of two minima, s.
@@ -52,16 +52,16 @@ def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: in
     rotation_body_from_dvl: (3, 3), None if unknown. Without an attitude, or with a body-frame reference, only the
     relative delay is observable and is assigned to the DVL.
     """
-    late, misfit = _misfits(motion, rotation_body_from_dvl)
-    by_reference = late if misfit.shape[0] > 1 else np.zeros(1)
-    near = (np.abs(by_reference)[:, None] <= 3.0) & (np.abs(late) <= 3.0)
-    found = _minima(misfit, by_reference, late, most)
-    found += _minima(np.where(near, misfit, np.inf), by_reference, late, 1)
+    delays, misfit = _misfits(motion, rotation_body_from_dvl)
+    by_reference = delays if misfit.shape[0] > 1 else np.zeros(1)
+    near = (np.abs(by_reference)[:, None] <= 3.0) & (np.abs(delays) <= 3.0)
+    found = _minima(misfit, by_reference, delays, most)
+    found += _minima(np.where(near, misfit, np.inf), by_reference, delays, 1)
     return sorted(set(found), key=lambda place: place.misfit)
 
 
 def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> list[ClockPlace]:
-    """Return the lowest local minima of the misfit."""
+    """Return at most `most` lowest local minima of a misfit (R, D) over reference and DVL delays (R,) and (D,), s."""
     around = np.pad(misfit, 1, constant_values=np.inf)  # only local minima, so that flanks of a broad one do not count
     is_lowest = np.minimum(misfit, np.minimum(around[2:, 1:-1], around[:-2, 1:-1])) == misfit
     is_lowest &= np.minimum(misfit, np.minimum(around[1:-1, 2:], around[1:-1, :-2])) == misfit
@@ -82,7 +82,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
     """Return delays (L,) s, and the misfit (L or 1, L) by reference delay and DVL delay."""
     step, grid = _grid(motion)
     reach = round(LONGEST_S / step)
-    late = step * np.arange(-reach, reach + 1)
+    delays = step * np.arange(-reach, reach + 1)
     v = _on_grid(motion.dvl.times, motion.dvl.velocity, grid, step)
     g = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
     n = len(grid)
@@ -93,7 +93,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
     if motion.in_earth and motion.has_attitude:
         attitude, oriented = attitude_at(motion.imu, grid, HOLE_S)
     shifts = range(-reach, reach + 1) if attitude is not None else (0,)
-    misfit = np.full((len(shifts), len(late)), np.inf)
+    misfit = np.full((len(shifts), len(delays)), np.inf)
     for row, shift in enumerate(shifts):
         b = _shifted(g, shift)
         if attitude is not None:
@@ -102,11 +102,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
             b = _Series(values, known, b.squares * known)
         of_b = np.fft.rfft(np.column_stack([b.values, b.known, b.squares]), size, axis=0)
         # Σ_t b(t) v(t + lag): count, squares of each where the other is known, products of all components
-        pairs = [
-            np.conj(of_b[:, 3]) * of_v[:, 3],
-            np.conj(of_b[:, 3]) * of_v[:, 4],
-            np.conj(of_b[:, 4]) * of_v[:, 3],
-        ]
+        pairs = [np.conj(of_b[:, 3]) * of_v[:, 3], np.conj(of_b[:, 3]) * of_v[:, 4], np.conj(of_b[:, 4]) * of_v[:, 3]]
         if rotation is not None:
             turned = np.conj(of_b[:, :3]) * (of_v[:, :3] @ rotation.T)
             pairs.append(turned.sum(axis=1))
@@ -122,7 +118,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
             alike = np.linalg.svd(matrices, compute_uv=False).sum(axis=1)  # either handedness will do for a search
         enough = (count >= least) & (squares > 0.0)
         misfit[row, enough] = (squares - 2.0 * alike)[enough] / (0.5 * squares[enough])
-    return late, np.maximum(misfit, 0.0)
+    return delays, np.maximum(misfit, 0.0)
 
 
 def _grid(motion: MotionStreams) -> tuple[float, Array]:
@@ -141,7 +137,7 @@ def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
     at = np.add.reduceat(times, starts) / count
     means = np.add.reduceat(values, starts, axis=0) / count[:, None]
     after = np.clip(np.searchsorted(at, grid), 1, max(len(at) - 1, 1))
-    hole = max(HOLE_S, HOLE_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
+    hole = max(HOLE_S, REACH_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
     if len(at) < 2:
         return _Series(np.zeros((len(grid), 3)), np.zeros(len(grid)), np.zeros(len(grid)))
     known = ((grid >= at[0]) & (grid <= at[-1]) & (at[after] - at[after - 1] <= hole)).astype(float)

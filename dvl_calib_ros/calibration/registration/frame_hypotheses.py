@@ -29,24 +29,22 @@ from ..numerics.frames import (
     squared,
     whole_degrees,
 )
+from ..numerics.robust import FEWEST_VALUES
 from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import enu_from, quaternion_product
-from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
-from .configuration_check import DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
+from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
+from .configuration_check import BETTER_BY, DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
-from .motion_streams import GAP_S, Curves, MotionStreams
+from .motion_streams import Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
 
-# Fewest samples of a comparison.
-ENOUGH_SAMPLES = 12
 # Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a
 # vehicle that only moves ahead) and changes observable ones by less than 0.1 degrees.
 AS_IT_IS = 1e-3
 # Share of samples kept; the rest are outliers or lags in turns.
 KEPT_SHARE = 0.9
-# Largest residual ratio of another reading to the declared one for it to be preferred ...
-CLEARLY = 0.5
-# ... and largest residual of it, as a share of the speed (17 degrees of misalignment).
+# Largest residual of a reading that is preferred to the declared one, as a share of the speed (17 degrees of
+# misalignment); its largest ratio is `BETTER_BY`.
 FITS = 0.3
 # Largest residual ratio that justifies a rotation about the direction of travel.
 ROLLED = 0.8
@@ -189,7 +187,7 @@ class Readings:
 
         rotation_dvl_from_body: (3, 3) mounting, None if unknown.
         """
-        if len(self) < ENOUGH_SAMPLES:
+        if len(self) < FEWEST_VALUES:
             return []
         known = rotation_dvl_from_body
         likely = np.eye(3) if known is None else known
@@ -231,6 +229,7 @@ class Readings:
         fit = self._fit(reading)
 
         def of(rotation: Array | None) -> Registered:
+            """Return the fit for a nominal DVL rotation, or for the fitted one if None."""
             nominal = None if rotation is None else rotation.T @ turn
             found = nearest(fit, nominal, (REFERENCE,)) if fit else None
             if found is None:
@@ -245,7 +244,7 @@ class Readings:
         best = of(None)
         turned = of(best.rotation_dvl_from_body @ FLU_FROM_FRD)
         upright, other = sorted((best, turned), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
-        return other if other.residual < CLEARLY * upright.residual else upright
+        return other if other.residual < BETTER_BY * upright.residual else upright
 
     def are_axes_mirrored(self, reading: Reading, found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
@@ -260,7 +259,7 @@ class Readings:
     def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
         """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""
         travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
-        least = _least_turn(rotation_dvl_from_body.T @ travel, travel)
+        least = least_turn(rotation_dvl_from_body.T @ travel, travel)
         is_needed = ROLLED * self.agreements([found.reading], least)[0].residual > found.best_residual
         return rotation_dvl_from_body if is_needed else least
 
@@ -304,10 +303,10 @@ def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> b
     rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)
     use = np.isfinite(rates).all(axis=1) & np.isfinite(own).all(axis=1)
     rates, own = rates[use], own[use]
-    if len(own) < ENOUGH_SAMPLES or _rms(own) < TURNS or _rms(rates) < TURNS:
+    if len(own) < FEWEST_VALUES or _rms(own) < TURNS or _rms(rates) < TURNS:
         return None
     left, right = _rms(own - rates), _rms(own @ FLU_FROM_FRD - rates)
-    return None if min(left, right) > CLEARLY * max(left, right) else right < left
+    return None if min(left, right) > BETTER_BY * max(left, right) else right < left
 
 
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
@@ -316,7 +315,7 @@ def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
     return nearest_rotation(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
 
 
-def _least_turn(a: Array, b: Array) -> Array:
+def least_turn(a: Array, b: Array) -> Array:
     """Return the rotation (3, 3) by the smallest angle from direction a (3,) to b."""
     axis = cross(a, b)
     sine = float(np.linalg.norm(axis))

@@ -18,11 +18,11 @@ import numpy as np
 
 from ..numerics.block_covariance import TimeBlocks
 from ..numerics.frames import Array, cross, nearest_rotation, rotation_of, skew, squared, turn_between
-from ..numerics.robust import MEDIAN_SQUARE, median
+from ..numerics.robust import FEWEST_SAMPLES, MEDIAN_SQUARE, median
 from ..numerics.samples import Index, Mask
 from ..numerics.tests import chi2_isf
-from ..streams.interpolation import attitude_at
-from .motion_streams import GAP_S, Curves, MotionStreams
+from ..streams.interpolation import GAP_S, attitude_at
+from .motion_streams import Curves, MotionStreams
 
 # States: rotation (rad, body), scale, lever arm (m), delays δ and ρ (s).
 TURN, SCALE, ARM, DELTA, RHO = slice(0, 3), 3, slice(4, 7), 7, 8
@@ -46,8 +46,8 @@ FARTHEST_S = 0.7
 ROUNDS_TO_FALL, HARDLY_LESS = 3, 0.9
 # Residual in σ at which a sample has half the weight.
 HALF_AT = 3.0
-# Lowest compared reference speed, m/s, and fewest rows of a fit.
-SLOW_MPS, ENOUGH = 0.1, 20
+# Lowest compared reference speed, m/s.
+SLOW_MPS = 0.1
 # Prior σ of an axis factor about 1, for factors that are not observable.
 WIDEST_FACTOR = 3.0
 # Largest share of the information on δ that is attributed to DVL noise.
@@ -134,10 +134,14 @@ class Fitted(NamedTuple):
 
 
 class AxisFactors(NamedTuple):
-    """Scale factors (3,) of the DVL's axes relative to the fit, and their σ (3,); 1 is right."""
+    """Scale factors (3,) of the DVL's axes relative to the fit, and their σ (3,); 1 is right.
+
+    level: residual with the factors, m/s per axis.
+    """
 
     factors: Array
     std: Array
+    level: float
 
 
 class _Rows(NamedTuple):
@@ -246,7 +250,7 @@ class MotionFit:
         """
         rows, rotation = self._rows(fitted.x, fitted.rotation_body_from_dvl, None), fitted.rotation_body_from_dvl
         if rows is None:
-            return AxisFactors(np.ones(3), np.full(3, np.inf))
+            return AxisFactors(np.ones(3), np.full(3, np.inf), fitted.level)
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
         own = self._axes_of_dvl(fitted, rows, rotation)
@@ -259,11 +263,11 @@ class MotionFit:
         information = (h * w[:, None]).T @ h + np.diag(prior)
         vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[kept]])
         found = np.linalg.solve(information, vector)
-        left = rows.residual.ravel() + h @ found
+        residual = rows.residual.ravel() + h @ found
         # residuals that the factors explain are no noise
-        share = float((w * left**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
+        share = float((w * residual**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
-        return AxisFactors(1.0 + found[:3], std)
+        return AxisFactors(1.0 + found[:3], std, fitted.level * math.sqrt(share))
 
     def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
         """Return the derivative (J, A, 3) m/s of the residuals with respect to the axis factors."""
@@ -292,7 +296,7 @@ class MotionFit:
             known = known & oriented
         if among is not None:
             known = known & self._shared(among, reference, apart)
-        if np.count_nonzero(known) < ENOUGH:
+        if np.count_nonzero(known) < FEWEST_SAMPLES:
             return None
         at = np.flatnonzero(known)
         seen, rotation = self._velocity[at], rotation[at]
@@ -371,6 +375,7 @@ class MotionFit:
 
 
 def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Claimed:
+    """Return covariance and σ factors of a solution, inflated for residuals that are correlated in time."""
     p = np.linalg.inv(information)
     blocks = TimeBlocks()
     for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):

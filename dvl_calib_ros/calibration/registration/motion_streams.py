@@ -14,6 +14,8 @@ from ..numerics.robust import median
 from ..numerics.samples import FRAME_CODES, Index, Mask, SampleBlock, Streams, VelocityFrame
 from ..streams.clock_correction import Clocks
 from ..streams.interpolation import (
+    BIN_S,
+    GAP_S,
     LEAST_SLOPE_REACH_S,
     MOST_REACH_S,
     REACH_INTERVALS,
@@ -97,11 +99,7 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     if code == FRAME_CODES[VelocityFrame.NED]:
         measured = measured[1], measured[0], measured[2]
     made = make_motion(
-        (dvl_times, velocity),
-        (reference_times, seen),
-        code != FRAME_CODES[VelocityFrame.BODY],
-        measured,
-        columns,
+        (dvl_times, velocity), (reference_times, seen), code != FRAME_CODES[VelocityFrame.BODY], measured, columns
     )
     return None if made is None else replace(made, epoch_ns=first_ns)
 
@@ -144,12 +142,10 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
     return block.part((block.refused == 0) & (speed <= parameters.max_speed) & (speed > 0.0))
 
 
-# Grid step of smoothed curves (s), most grid points of a long recording, and points per pass.
-GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
+# Most grid points of the smoothed curves of a long recording, and points per pass.
+MOST_GRID, AT_ONCE = 18_000, 1000
 # Turn rates farther from the DVL data are not used, s: larger than any searched delay.
 TURNS_BEYOND_S = 3600.0
-# Longest gap between attitudes or rates that is interpolated, s.
-GAP_S = 2.0
 
 
 class Curves:
@@ -159,7 +155,7 @@ class Curves:
         """Smooth the streams of a motion."""
         times = motion.dvl.times
         length = float(times[-1] - times[0])
-        self._step, self._start = max(GRID_S, length / MOST_GRID), float(times[0])
+        self._step, self._start = max(BIN_S, length / MOST_GRID), float(times[0])
         self._grid = self._start + self._step * np.arange(int(length / self._step) + 2)
         typical = float(median(np.diff(times)))
         reach = reach_at(spacing_at(times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)
@@ -207,9 +203,10 @@ def _parts(n: int) -> list[slice]:
 
 
 def _between(values: Array, before: Index, share: Array) -> Array:
-    left = values.take(before, axis=0)
+    """Interpolate rows linearly between index `before` and the next, at a share (0..1)."""
+    before_value = values.take(before, axis=0)
     found: Array = values.take(before + 1, axis=0)
-    found -= left
+    found -= before_value
     found *= share
-    found += left
+    found += before_value
     return found

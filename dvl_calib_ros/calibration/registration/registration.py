@@ -17,7 +17,7 @@ from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.tests import RULED_OUT, Z_FIFTY_TESTS
-from .clock_drift_and_jumps import MOST_STRETCHES, STRETCH_S, ClockChange, stamps, unsteady
+from .clock_drift_and_jumps import MOST_STRETCHES, REPORTED_FROM_S, STRETCH_S, ClockChange, stamps, unsteady
 from .delay_search import LONGEST_S, places
 from .gauss_newton import (  # fmt: skip
     ARM,
@@ -37,9 +37,6 @@ from .gauss_newton import (  # fmt: skip
 )
 from .motion_streams import Curves, MotionStreams
 
-# Smallest delay that is reported, s. It shifts a lever arm by a tenth of a second times the speed. Interpolated
-# attitudes and the filters of an INS have smaller delays (five real recordings: 0.03 to 0.07 s).
-REPORTED_FROM_S = 0.1
 # Chi-square that each additional delayed clock must gain.
 ONE_MORE = 12.0
 # Chi-square by which the next explanation must be worse for a refusal, if the σ of the calibration cover the delay. The
@@ -65,8 +62,6 @@ KNOWN_STD_S, KNOWN_SHARE, KNOWN_AT_MOST_S = 0.25, 0.12, 0.35
 OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
 # Smaller DVL delays are left to the calibration (full), which estimates them at any stamps, s.
 LEFT_TO_CALIBRATION_S = 2.5
-# Largest difference of two estimates of the same delay, s.
-ALIKE_S = 0.1
 # Prior σ of the reference delay, s: receivers and filters have delays of tenths of a second.
 IN_TIME_STD_S = 0.5
 # From this many σ on, the fitted delay of a clock assumed synchronised becomes its σ. From this multiple of the prior σ
@@ -176,10 +171,10 @@ class Registration:
         if not clock.is_shown or (self.next_worse < REFUSED_FROM and self._holds(clock)):
             return self.ambiguity
         offset = round(getattr(parameters, name) + clock.delay_s, 2)
-        off = {"seconds": abs(clock.delay_s), "way": _way(clock), "parameter": name, "offset": offset}
+        values = {"seconds": abs(clock.delay_s), "way": _way(clock), "parameter": name, "offset": offset}
         if clock is self.reference and self.dvl.is_shown:
-            return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.delay_s), dvl_way=_way(self.dvl), **off)
-        return finding("CLOCK_LATE", whose=OFFSETS[name], **off)
+            return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.delay_s), dvl_way=_way(self.dvl), **values)
+        return finding("CLOCK_LATE", whose=OFFSETS[name], **values)
 
     def _holds(self, clock: Clock) -> bool:
         """Return whether the σ of a calibration that assumes synchronisation cover the delay of a clock."""
@@ -389,7 +384,7 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fit
     A delay may lower the residual by moving a bad DVL stretch out of the overlap. Candidates with other DVL delays also
     sample other DVL noise; in periodic waves this alone makes a difference.
     """
-    is_read_elsewhere = abs(float(one.x[DELTA]) - float(closest.x[DELTA])) > ALIKE_S
+    is_read_elsewhere = abs(float(one.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
     enough = GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
     if _gain(motion, one, closest) < enough:
         return True

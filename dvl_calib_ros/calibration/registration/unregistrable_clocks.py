@@ -15,19 +15,19 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..streams.interpolation import attitude_at, shortened
-from .delay_search import HOLE_S, LONGEST_S
+from .delay_search import HOLE_S, LONGEST_S, OVERLAP, STEP_S
 from .motion_streams import MotionStreams
 
 # Largest share of the squared residual at the best near delay that a far delay may leave. Repeated legs agree to a
 # half.
 BELIEVED = 0.25
-# Time step of the series, s; smallest overlap as a share of the shorter series, and in seconds.
-STEP_S, OVERLAP, FEWEST_S = 0.5, 0.4, 60.0
+# Smallest overlap, s.
+FEWEST_S = 60.0
 # Longest series, s, or steps per sample: memory must not grow with pauses.
 LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE = 86_400.0, 16
 # Width of the running median that removes spikes of the speed, steps.
 SPIKE_STEPS = 9
-# Lowest speed whose course is compared with the heading.
+# Lowest speed that determines a direction.
 MOVING_MPS = 0.2
 Series = NDArray[Any]  # complex
 
@@ -167,8 +167,8 @@ def lag(
         return np.where(enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
 
     mean = means(weight)
-    late = one_start - other_start + STEP_S * np.arange(-(m - 1), n)
-    near = np.abs(late) <= LONGEST_S + STEP_S
+    delays = one_start - other_start + STEP_S * np.arange(-(m - 1), n)
+    near = np.abs(delays) <= LONGEST_S + STEP_S
     best = int(np.argmin(mean))
     nearest = float(mean[near].min()) if near.any() else np.inf
     if not near[best] and mean[best] < BELIEVED * nearest:
@@ -181,9 +181,9 @@ def lag(
         of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
         if mean[best] < BELIEVED * nearest and nearest > of_a_step:
             # repeated legs agree at several lags: take the smallest
-            as_good = np.where(mean <= 1.5 * mean[best], np.abs(late), np.inf)
-            return float(late[int(np.argmin(as_good))]), True
+            as_good = np.where(mean <= 1.5 * mean[best], np.abs(delays), np.inf)
+            return float(delays[int(np.argmin(as_good))]), True
     best = int(np.argmin(np.where(near, mean, np.inf)))
     # a nearly constant speed agrees as well at any lag
-    is_better = near[best] and mean[best] < BELIEVED * mean[int(np.argmin(np.abs(late)))]
-    return float(late[best]) if is_better else 0.0, False
+    is_better = near[best] and mean[best] < BELIEVED * mean[int(np.argmin(np.abs(delays)))]
+    return float(delays[best]) if is_better else 0.0, False

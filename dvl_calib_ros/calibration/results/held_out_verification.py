@@ -100,6 +100,7 @@ def use_findings(used_and_gated: tuple[int, int] | None) -> list[Reason]:
 
 
 def _lever_arm_findings(turns: Reason | None, is_found: bool, parameters: Parameters) -> list[Reason]:
+    """Return the finding on a lever arm that can rotate an angle; none if turns separate the two."""
     if turns is None:
         return []
     if is_found:
@@ -112,8 +113,8 @@ def shown_misalignment(model: Model, state: GaussianState, parameters: Parameter
     t = parameters.rotation_dvl_from_body
     about = t.T @ (model.error_terms_from_state @ state.x)[:3]
     std = body_angle_std(state.p, parameters)
-    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > Z_ONE_TEST * std)
-    return np.where(shown, about, 0.0)
+    observable = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > Z_ONE_TEST * std)
+    return np.where(observable, about, 0.0)
 
 
 def shown_mounting(model: Model, state: GaussianState, parameters: Parameters) -> tuple[float, float, float]:
@@ -133,6 +134,7 @@ def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> R
 
 
 def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -> list[Reason]:
+    """Return findings on a misalignment or scale error too large to be plausible."""
     errors = model.error_terms_from_state @ state.x
     angle, reject = _angle_deg(model, state, parameters), math.degrees(parameters.reject_misalignment)
     findings = []

@@ -436,8 +436,8 @@ def scale_and_delay(model: Model, state: GaussianState, parameters: Parameters) 
 
 OFFSETS = "reference_east", "reference_north"
 ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
-# Smallest difference that contradicts the configured lever arm: the error of a tape measure, m.
-MEASURED_TO = 0.05
+# σ of a configured lever arm, m: the error of a tape measure. Smaller differences do not contradict it.
+TAPE_STD_M = 0.05
 # σ of the estimate, in errors of a tape measure, above which the configured lever arm is kept.
 WORSE_THAN_TOLD = 2.0
 
@@ -452,7 +452,7 @@ def keeps_configured_arm(model: Model, state: GaussianState, parameters: Paramet
     if not any(parameters.lever_arm) or not estimates_lever_arm(model):
         return np.zeros(3, dtype=bool)
     std = np.sqrt(np.diag(state.p)[[model.state_names.index(name) for name in ARM]])
-    return contradicts_configured_arm(model, state, parameters) | np.asarray(std > WORSE_THAN_TOLD * MEASURED_TO)
+    return contradicts_configured_arm(model, state, parameters) | np.asarray(std > WORSE_THAN_TOLD * TAPE_STD_M)
 
 
 def contradicts_configured_arm(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
@@ -461,4 +461,4 @@ def contradicts_configured_arm(model: Model, state: GaussianState, parameters: P
         return np.zeros(3, dtype=bool)
     at = [model.state_names.index(name) for name in ARM]
     away, std = np.abs(state.x[at]), np.sqrt(np.diag(state.p)[at])
-    return np.asarray(away > np.maximum(Z_REPEATED_TEST * std, MEASURED_TO))
+    return np.asarray(away > np.maximum(Z_REPEATED_TEST * std, TAPE_STD_M))

@@ -164,6 +164,7 @@ def thinned(stamps_ns: Stamps) -> Index:
 
 
 def _thinned_seconds(times: Array) -> Index:
+    """Return indices of times (N,) s about `KEPT_EVERY_S` apart."""
     if len(times) < 2 or steps(times).min() >= KEPT_EVERY_S:
         return np.arange(len(times))
     bins = np.floor(times / KEPT_EVERY_S)

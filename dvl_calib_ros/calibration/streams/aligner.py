@@ -219,6 +219,7 @@ class Aligner(LiveAlignment):
                 self.take(half)
 
     def _take_rows(self, streams: Streams) -> None:
+        """Take the rows one by one in order of arrival."""
         take = {Stream.DVL: self.take_dvl, Stream.REFERENCE: self.take_reference, Stream.IMU: self.take_imu}
         for stream, row in streams.in_order():
             if isinstance(row, str):
@@ -269,7 +270,7 @@ class Aligner(LiveAlignment):
             refused = np.bincount(block.refused, minlength=1 + len(block.reasons))[1:]
             for reason, count in zip(block.reasons, refused.tolist(), strict=True):
                 if count:
-                    self.refused_as[block.stream.value].add(reason)
+                    self.reason_of_refusal[block.stream.value].add(reason)
                     tally[reason] += count
             add_count(tally, "invalid", len(block) - int(np.count_nonzero(is_valid)) - int(refused.sum()))
             add_count(tally, "duplicate", order.duplicate)
@@ -343,7 +344,7 @@ def counted(
         counts["reference"].setdefault(key, 0)
     for key in ("paired", "unpaired", "without_attitude", "oriented", "not_oriented"):
         pairing.setdefault(key, 0)
-    not_accepted = {"invalid", "duplicate", "out_of_order", "stray", "held", *aligner.refused_as["dvl"]}
+    not_accepted = {"invalid", "duplicate", "out_of_order", "stray", "held", *aligner.reason_of_refusal["dvl"]}
     dvl["accepted"] = dvl["received"] - sum(dvl.get(key, 0) for key in not_accepted)
     dvl["awaiting_imu"] = aligner.rows.end - aligner.partners.n_judged
     dvl["usable"] = dvl["accepted"] - sum(dvl[key] for key in (*unused, "awaiting_imu"))
@@ -355,7 +356,7 @@ def counted(
     return counts
 
 
-def whereabouts(
+def counts_by_use(
     counts: Mapping[str, Mapping[str, int]], needs: Needs, given: int, used: int, gated: int
 ) -> dict[str, int]:
     """Return the number of received DVL samples in each state, for one model; the sum is ``received``.

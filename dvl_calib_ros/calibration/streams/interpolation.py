@@ -17,9 +17,12 @@ from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask
 
 LONGEST_DELAY_S = 3.2
-# Samples at shorter intervals (s) than FASTER_THAN_S are averaged over bins (s): same accuracy, bounded work.
+# Interval to which streams are averaged or sampled, s: same accuracy, bounded work. Samples at intervals above
+# FASTER_THAN_S (s) are kept.
 BIN_S = 0.1
 FASTER_THAN_S = 0.07
+# Longest gap between attitudes or rates that is interpolated, and between velocities that are integrated, s.
+GAP_S = 2.0
 # Smallest reach of the fit for value and slope, s. The slope needs more, because its noise biases the delay: 0.01 m/s
 # at 5 Hz is 0.006 m/s² over 1 s, an eighth of the acceleration of a turning vehicle.
 LEAST_REACH_S, LEAST_SLOPE_REACH_S = 0.6, 1.0
@@ -75,7 +78,7 @@ class TurnRates(NamedTuple):
 
 
 def shortened(pauses: Array, most: float) -> Array:
-    """Return pauses (N,), the longest of them cut to one length so that all together last `most` at most."""
+    """Clip the longest pauses (N,), s, to a common length so that their sum is at most `most`, s."""
     if pauses.sum() <= most:
         return pauses
     in_order = np.sort(pauses)
@@ -245,8 +248,8 @@ def _within(times: Array, seconds: float) -> int:
     """
 
     def some(n: int) -> bool:
-        apart = times[n:] - times[:-n]
-        return bool(((apart < seconds) & (apart >= 0.0)).any())
+        duration = times[n:] - times[:-n]
+        return bool(((duration < seconds) & (duration >= 0.0)).any())
 
     low, high = 0, 1
     while some(high):

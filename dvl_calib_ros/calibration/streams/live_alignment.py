@@ -30,13 +30,22 @@ from ..numerics.samples import (
 from .clock_correction import SECOND_NS, Clocks
 from .pairing import Pairer, Rows, add_count
 from .screening import ALL_AXES, VERTICAL, CovarianceScreen, is_valid_rate, is_valid_velocity, unit_quaternion
-from .stream_order import DROPOUT_NS, LONG_AGO_NS, SHORTEST_PAUSE_NS, Dropouts, NewDays, Order, Sequencer, Track
+from .stream_order import (
+    DROPOUT_NS,
+    LONG_AGO_NS,
+    NEVER_NS,
+    SHORTEST_PAUSE_NS,
+    Dropouts,
+    NewDays,
+    Order,
+    Sequencer,
+    Track,
+)
 
 # Largest DVL lag behind GNSS and IMU with available partners, ns, beyond the latency of pairing.
 RETENTION_NS = 10 * SECOND_NS
 # Additional lag between streams due to a delay of seconds, which the full model estimates, ns.
 WRONG_CLOCK_NS = 4 * SECOND_NS
-NEVER_NS = 2**63 - 1
 # Live samples between two purges of old GNSS and IMU samples.
 FORGET_EVERY = 256
 _NAN_4, _NAN_3 = (math.nan,) * 4, (math.nan,) * 3
@@ -90,7 +99,7 @@ class LiveAlignment:
             name: Counter() for name in (*(each.value for each in Stream), "pairing")
         }
         # counter names of refused messages, by stream
-        self.refused_as: dict[str, set[str]] = {stream.value: set() for stream in Stream}
+        self.reason_of_refusal: dict[str, set[str]] = {stream.value: set() for stream in Stream}
         # streams that still deliver samples from before a restart of the DVL stamps
         self._before_restart: set[Stream] = set()
         self._n_messages = 0
@@ -129,7 +138,7 @@ class LiveAlignment:
 
     def refuse(self, stream: Stream, reason: str) -> None:
         """Count a message of a stream that is no sample, by reason."""
-        self.refused_as[stream.value].add(reason)
+        self.reason_of_refusal[stream.value].add(reason)
         self.tally[stream.value]["received"] += 1
         self.tally[stream.value][reason] += 1
         self._n_messages += stream is Stream.DVL

@@ -5,21 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from ..numerics.frames import Array
-from ..numerics.robust import median, robust_std
+from ..numerics.robust import FEWEST_VALUES, median, robust_std
 from ..numerics.samples import Mask
 
 # Deviation in robust σ from which a sample is an outlier; most passes, as outliers hide each other.
 SPIKE, PASSES = 12.0, 6
-# Fewest samples with a meaningful scatter.
-FEWEST = 10
 
 
 def deviation_from_neighbours(values: Array) -> Array:
     """Return deviations (N, k) from the cubic through two neighbours on either side; 0 at the ends."""
-    off = np.zeros_like(values)
+    deviation = np.zeros_like(values)
     x = values
-    off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
-    return off
+    deviation[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
+    return deviation
 
 
 def neighbours(sizes: Array) -> Array:
@@ -28,36 +26,36 @@ def neighbours(sizes: Array) -> Array:
 
 
 def without_spikes(
-    values: Array, loudness: Array | None = None, smallest: float = 1e-9, *, also_at_ends: bool = False
+    values: Array, relative_noise: Array | None = None, smallest: float = 1e-9, *, also_at_ends: bool = False
 ) -> Mask:
     """Return a mask (N,) of the samples that are no outliers.
 
     Parameters
     ----------
     values: (N, k), in order of time and about evenly spaced.
-    loudness: (N, k) noise σ of each sample relative to the usual one; None if equal.
+    relative_noise: (N, k) noise σ of each sample relative to the usual one; None if equal.
     smallest: Lower limit of the robust σ, in the unit of the values.
     also_at_ends: Also judge the first and last two samples, by the median of five; may reject good ones while the
         vehicle accelerates.
     """
     kept = np.arange(len(values))
     for _ in range(PASSES):
-        if len(kept) < FEWEST:
+        if len(kept) < FEWEST_VALUES:
             break
         x = values[kept]
-        loud = np.ones_like(x) if loudness is None else loudness[kept]
-        off = deviation_from_neighbours(x) / loud
-        scale = np.maximum(robust_std(off), smallest)
+        noise = np.ones_like(x) if relative_noise is None else relative_noise[kept]
+        deviation = deviation_from_neighbours(x) / noise
+        scale = np.maximum(robust_std(deviation), smallest)
         if also_at_ends:
-            off[:2], off[-2:] = (x[:2] - median(x[:5])), (x[-2:] - median(x[-5:]))
-        far = (np.abs(off) / scale).max(axis=1)
+            deviation[:2], deviation[-2:] = (x[:2] - median(x[:5])), (x[-2:] - median(x[-5:]))
+        far = (np.abs(deviation) / scale).max(axis=1)
         at = np.flatnonzero(far >= SPIKE)
         if not len(at):
             break
         # a good sample between two outliers deviates from them, but not from the median of five
         about = np.clip(at, 2, len(far) - 3)[:, None] + np.arange(-2, 3)
-        alone = np.abs(x[at] - median(x[about].swapaxes(0, 1))) / loud[at]
-        far[at] = (np.minimum(np.abs(off[at]), alone) / scale).max(axis=1)
+        alone = np.abs(x[at] - median(x[about].swapaxes(0, 1))) / noise[at]
+        far[at] = (np.minimum(np.abs(deviation[at]), alone) / scale).max(axis=1)
         good = (far < SPIKE) | (far < neighbours(far))  # the neighbour of a larger outlier deviates because of it
         if good.all():
             break

@@ -7,14 +7,12 @@ import numpy as np
 from ..models import POSITIONS
 from ..models.parameters import ParameterError, Parameters
 from ..numerics.frames import Array, cross
-from .interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
+from .interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
 
 # Noise from which velocities derived from positions are useless, m/s.
 NOISY_MPS = 0.3
 # Factors of the second, fourth and sixth difference in the inverse of a mean (arcsine series).
 SERIES = -1.0 / 24.0, 3.0 / 640.0, -5.0 / 7168.0
-# Longest interpolated gap of an IMU, s.
-GAP_S = 1.0
 
 
 def are_positions(parameters: Parameters) -> bool:
@@ -57,16 +55,16 @@ def _deconvolved(times: Array, velocity: Array, window_s: float) -> Array:
         return velocity
     known = np.ones(len(times), dtype=bool)
     sides = []
-    for asked in (times - window_s, times + window_s):
-        after = np.clip(np.searchsorted(times, asked), 1, len(times) - 1)
+    for shifted in (times - window_s, times + window_s):
+        after = np.clip(np.searchsorted(times, shifted), 1, len(times) - 1)
         # no correction beyond an end and across an outage
-        known &= (asked >= times[0]) & (asked <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
-        sides.append(asked)
+        known &= (shifted >= times[0]) & (shifted <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
+        sides.append(shifted)
     found, bend = velocity.copy(), velocity
     for factor in SERIES:
-        around = sum(np.column_stack([np.interp(asked, times, axis) for axis in bend.T]) for asked in sides)
+        around = sum(np.column_stack([np.interp(shifted, times, axis) for axis in bend.T]) for shifted in sides)
         bend = np.where(known[:, None], around - 2.0 * bend, 0.0)
         found += factor * bend
         # the next difference needs this one on both sides
-        known = known & np.all([np.interp(asked, times, known) > 0.99 for asked in sides], axis=0)
+        known = known & np.all([np.interp(shifted, times, known) > 0.99 for shifted in sides], axis=0)
     return found

@@ -353,7 +353,7 @@ def parts_by_day(days: Sequence[int], first: int, end: int) -> Iterator[tuple[in
 # A dropout is a DVL gap longer than this, ns, and than this multiple of its shortest interval.
 DROPOUT_NS = SECOND_NS
 DROPOUT_INTERVALS = 3
-_NEVER_NS = 2**63 - 1
+NEVER_NS = 2**63 - 1
 
 
 class Dropouts:
@@ -361,7 +361,7 @@ class Dropouts:
 
     def __init__(self) -> None:
         self.longest_ns = 0
-        self._shortest_interval_ns = _NEVER_NS
+        self._shortest_interval_ns = NEVER_NS
 
     def add(self, interval_ns: Stamps) -> int:
         """Add the intervals (N,) between samples, in order. Return the number of dropouts."""

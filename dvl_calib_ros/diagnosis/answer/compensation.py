@@ -141,8 +141,8 @@ def _is_one_correction(diagnosis: Diagnosis, effect: FoundEffect) -> bool:
         return {effect.name, *effect.equivalent_to} <= {*TWO_CLOCKS}
     rivals = [rival for each in selection.selected if each.effect.name == effect.name for rival in each.rivals]
     own, (_, low, high) = _delays_from_attitude(selection.fit.hypothesis), effect.parameters["seconds"]
-    alike = [each for each in rivals if np.all(np.abs(_delays_from_attitude(each) - own) < 0.5 * (high - low))]
-    return all(any(name in rival.values for rival in alike) for name in effect.equivalent_to)
+    equal_delays = [each for each in rivals if np.all(np.abs(_delays_from_attitude(each) - own) < 0.5 * (high - low))]
+    return all(any(name in rival.values for rival in equal_delays) for name in effect.equivalent_to)
 
 
 def _delays_from_attitude(hypothesis: Hypothesis) -> Array:

@@ -27,7 +27,7 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     covariance, _ = robust_covariance(fitter.problem, fit)
     if not selection.selected:
         return covariance, {}
-    covariance = with_unshown_turns(fitter.problem, fit, covariance)
+    covariance = with_unobservable_turns(fitter.problem, fit, covariance)
     times: Times = {}
     for effect in fit.effects:
         for spec in filter(is_time_of_run, effect.parameters):
@@ -39,7 +39,7 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     return covariance, times
 
 
-def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
+def with_unobservable_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
     """Add the uncertainty from unobservable rotations of a moving mounting to a covariance (n, n).
 
     A mounting rotated by 4 degrees in pitch shifts yaw by a few tenths of a degree and the arm by centimetres.

@@ -19,7 +19,7 @@ from ..model.hypothesis import Hypothesis, Values
 from ..model.recorded_streams import RecordedStreams
 from ..model.stream_curve import Curve
 from ..search.effect_selection import EffectSelection
-from .simulated_twin import simulated, with_quiet_reference
+from .simulated_twin import simulated, with_denoised_reference
 
 Three = tuple[float, float, float]
 # Parameters of effects that the calibration may already correct; the estimate is added
@@ -57,7 +57,7 @@ STALE = "stale_samples"
 def dvl_seen(selection: EffectSelection, parameters: Parameters) -> DvlSeen:
     """Describe the DVL of a selection; parameters: those with which the recordings were read."""
     problem = replace(selection.fitter.problem, lever_arm=np.zeros(3))
-    hypothesis = _whole(selection, parameters)
+    hypothesis = _with_configured(selection, parameters)
     measured = _measured(problem, hypothesis)
     without = {
         "misalignment": replace(hypothesis, phi=np.zeros(3)),
@@ -73,18 +73,18 @@ def dvl_seen(selection: EffectSelection, parameters: Parameters) -> DvlSeen:
         sizes[STALE] = float(np.sqrt(repeats / received)) * _rms(np.diff(measured, axis=0))
     streams = [recording.dvl for recording in problem.recordings]
     return DvlSeen(
-        mounting_rpy=_three(parameters.mounting_rpy),
-        lever_arm=_three(parameters.lever_arm),
+        mounting_rpy=_triple(parameters.mounting_rpy),
+        lever_arm=_triple(parameters.lever_arm),
         time_offset=parameters.dvl_time_offset,
         clock_drift=parameters.dvl_clock_drift,
         rate_hz=1.0 / float(np.median([stream.interval for stream in streams])),
-        noise_std=_three(_noise(problem.recordings, selection)),
-        speed=_three(np.sqrt((measured**2).mean(axis=0))),
+        noise_std=_triple(_noise(problem.recordings, selection)),
+        speed=_triple(np.sqrt((measured**2).mean(axis=0))),
         sizes=sizes,
     )
 
 
-def _whole(selection: EffectSelection, parameters: Parameters) -> Hypothesis:
+def _with_configured(selection: EffectSelection, parameters: Parameters) -> Hypothesis:
     """Return the hypothesis plus the corrections that the parameters had made before the fit."""
     hypothesis = selection.fit.hypothesis
     n = len(selection.fitter.problem.recordings)
@@ -119,15 +119,15 @@ def _noise(recordings: Sequence[RecordedStreams], selection: EffectSelection) ->
     The former includes motion too fast for the DVL's rate, bounded by the reported noise if slow. The latter includes
     noise of the reference.
     """
-    problem = with_quiet_reference(selection.fitter.problem)
+    problem = with_denoised_reference(selection.fitter.problem)
     variances = []
     for index, recording in enumerate(recordings):
-        rest = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
+        residual = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
         own = recording.dvl.noise
-        variances.append(np.minimum(own, Curve(recording.dvl.time, rest).roughness) ** 2)
+        variances.append(np.minimum(own, Curve(recording.dvl.time, residual).roughness) ** 2)
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
 
 
-def _three(values: Sequence[float] | Array) -> Three:
+def _triple(values: Sequence[float] | Array) -> Three:
     x, y, z = map(float, values)
     return x, y, z

@@ -17,7 +17,7 @@ from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
-from ..search.unexplained import Unexplained, matters
+from ..search.unexplained import Unexplained, is_predictive
 
 RESAMPLES = 1000
 Integers = NDArray[np.intp]
@@ -52,7 +52,7 @@ class Gap:
         return float(np.sqrt(max(0.0, self.after**2 - self.noise_floor**2 - self.left_open**2)))
 
     @property
-    def fails_elsewhere(self) -> bool:
+    def fails_held_out(self) -> bool:
         """Return whether the effects leave more than the noise in stretches that they were not fitted to."""
         return self.not_expected > self.noise_floor
 
@@ -78,7 +78,7 @@ class HeldOutResiduals:
         """Return the squares of before, after and floor, summed per block (B,), (m/s)²."""
         return self._summed(self.before**2), self._summed(self.after**2), self._summed(self.floor)
 
-    def open_of_blocks(self) -> Array:
+    def undetermined_of_blocks(self) -> Array:
         """Return sums of left_open per block (B,), (m/s)², bounded by the block's excess over the noise."""
         _, after, floor = self.squares()
         left_open = np.bincount(self.block, np.broadcast_to(self.left_open, len(self.block)))
@@ -88,11 +88,11 @@ class HeldOutResiduals:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
 
 
-def held_out(selection: EffectSelection, rest: Unexplained) -> HeldOutResiduals:
+def held_out(selection: EffectSelection, unexplained: Unexplained) -> HeldOutResiduals:
     """Return the errors before and after the effects of a selection on held-out data.
 
     One recording is split into alternating stretches. Of several, each is held out, and parameters per recording
-    (`Effect.of_the_day`) are fitted to it. All parameters are re-estimated in the composed model.
+    (`Effect.per_recording`) are fitted to it. All parameters are re-estimated in the composed model.
     """
     fitter, fit = selection.fitter, selection.fit
     problem = fitter.problem
@@ -103,25 +103,25 @@ def held_out(selection: EffectSelection, rest: Unexplained) -> HeldOutResiduals:
         at = (fold_of == fold)[problem.bin_of]
         for fitted, into in zip(each, (before, after), strict=True):
             if len(problem.recordings) > 1:
-                of_day = _with_its_own_day(selection, fitted.hypothesis, fold)
+                of_day = _fit_own_parameters(selection, fitted.hypothesis, fold)
                 into[at] = only(problem, fold).errors(of_day.seen)
             else:
                 into[at] = problem.errors(fitted.seen)[at]
-        left_open[at] = _left_open(each[-1])[problem.bin_of][at]
+        left_open[at] = _undetermined(each[-1])[problem.bin_of][at]
     block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
     return HeldOutResiduals(
         before,
         after,
-        noise_floor(selection, rest),
+        noise_floor(selection, unexplained),
         np.asarray(block, dtype=np.intp),
         left_open,
     )
 
 
-def _left_open(fit: Fit) -> Array:
+def _undetermined(fit: Fit) -> Array:
     """Return the predicted error variance (M,), (m/s)², of a fit per bin. Parameters per recording do not contribute:
     they are fitted to the held-out recording."""
-    of_day = [each.effect.of_the_day and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
+    of_day = [each.effect.per_recording and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
     return np.asarray(_error_variance(fit, np.flatnonzero(~np.array([False] * 6 + of_day))).sum(axis=1))
 
 
@@ -131,7 +131,7 @@ def _error_variance(fit: Fit, at: Integers) -> Array:
     return np.asarray(np.einsum("map,map->ma", columns @ covariance, columns))
 
 
-def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
+def _fit_own_parameters(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
     """Fit one recording's own parameters, with the vehicle's parameters from the others."""
     problem, noise = selection.fitter.problem, selection.fit.noise
     alone = only(problem, recording)
@@ -139,19 +139,19 @@ def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, record
     outliers = selection.fitter.outliers
     fitter = Fitter(alone, outliers[of_it] if isinstance(outliers, np.ndarray) else outliers)
     values = {name: (per[recording],) for name, per in hypothesis.values.items()}
-    return fitter.fit(replace(hypothesis, values=values), noise.part(of_it), only_of_the_day=True)
+    return fitter.fit(replace(hypothesis, values=values), noise.part(of_it), only_own=True)
 
 
 def only(problem: Problem, recording: int) -> Problem:
     """Return the problem of one recording."""
-    made = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
-    return replace(made, grids=(problem.grids[recording],), of_axes=problem.measured)
+    problem_of_one = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
+    return replace(problem_of_one, grids=(problem.grids[recording],), of_axes=problem.measured)
 
 
 def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
     """Return held-out errors before and after the effects of a selection."""
     before, after, floor = residuals.squares()
-    left_open, n = residuals.open_of_blocks(), len(residuals.before)
+    left_open, n = residuals.undetermined_of_blocks(), len(residuals.before)
     squares = [float(part.sum()) / n for part in (before, after, floor)]
     return Gap(
         before=float(np.sqrt(squares[0])),
@@ -172,12 +172,12 @@ def _drift(selection: EffectSelection, residuals: HeldOutResiduals) -> tuple[Dri
     problem = selection.fitter.problem
     step_s = integration_steps(problem.sample_time)
     speed = problem.sampled(selection.fit.seen, lambda motion: motion.speed)[problem.bin_of]
-    along = np.cumsum(speed * step_s)
-    if along[-1] < SHORTEST_M:
+    distance = np.cumsum(speed * step_s)
+    if distance[-1] < SHORTEST_M:
         return None
-    ends = ends_of_stretches(along)
+    ends = ends_of_stretches(distance)
     astray = (np.cumsum(each[:, :2] * step_s[:, None], axis=0) for each in (residuals.before, residuals.after))
-    before, after = (drift_over(each, along, ends) for each in astray)
+    before, after = (drift_over(each, distance, ends) for each in astray)
     return before, after
 
 
@@ -201,7 +201,7 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
 
     rng = np.random.default_rng(0)
     spread = np.sqrt(blocks / rng.chisquare(blocks, (RESAMPLES, 1)))  # the scatter of blocks is itself estimated
-    moved = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
+    draws = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
     columns = without_calibration(fit.columns[:, :, 6:])
     others = [rival for selected in selection.selected for rival in selected.rivals]
     if selection.wider is not None and len(selection.wider.effects) > len(fit.effects):
@@ -209,14 +209,14 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     residuals_of = [fit.residual, *(fitter.evaluated(each)[1] for each in others)]
     truths = [without_calibration(selection.base.residual - each)[:, 0] for each in residuals_of]
     corrected = truths[0]
-    of_cause = rows * max(remainder(selection, residuals), gap.not_expected**2 if gap.fails_elsewhere else 0.0)
+    of_cause = rows * max(remainder(selection, residuals), gap.not_expected**2 if gap.fails_held_out else 0.0)
     gram = columns.T @ columns
     shares = []
-    for true, step in zip(truths, np.array_split(moved, len(truths)), strict=True):
-        around = np.einsum("ri,ij,rj->r", step, gram, step)
-        left, whole = true - corrected, true
-        of_left, of_whole = (each @ each - 2.0 * step @ (columns.T @ each) + around for each in (left, whole))
-        share = 1.0 - (of_left + of_cause) / np.maximum(of_whole + of_cause, 1e-300)
+    for true_error, step in zip(truths, np.array_split(draws, len(truths)), strict=True):
+        variance = np.einsum("ri,ij,rj->r", step, gram, step)
+        residual, error = true_error - corrected, true_error
+        of_residual, of_error = (each @ each - 2.0 * step @ (columns.T @ each) + variance for each in (residual, error))
+        share = 1.0 - (of_residual + of_cause) / np.maximum(of_error + of_cause, 1e-300)
         shares.append(np.clip(share, -1.0, 1.0))
     low, high = np.percentile(np.concatenate(shares), [2.5, 97.5]).tolist()
     closure = float(np.median(shares[0]))
@@ -226,11 +226,12 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
 
 def remainder(selection: EffectSelection, residuals: HeldOutResiduals) -> float:
     """Return the energy per sample, (m/s)², of the residual of all data beyond the noise."""
-    left = selection.fitter.problem.errors(selection.fit.seen)
-    return max(0.0, float(((left**2).sum() - residuals.floor.sum()) / len(left)))
+    residual = selection.fitter.problem.errors(selection.fit.seen)
+    return max(0.0, float(((residual**2).sum() - residuals.floor.sum()) / len(residual)))
 
 
 def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tuple[float, float]]:
+    """Return RMS errors (m/s) before and after the effects by recording; empty for a single one."""
     if len(problem.recordings) == 1:
         return {}
     of_sample = problem.recording_of[problem.bin_of]
@@ -258,22 +259,22 @@ def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
 # ------------------------------------------------------------------ noise
 
 
-def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
+def noise_floor(selection: EffectSelection, unexplained: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
     It is the squared residual, so that noise common to the errors before and after cancels in the gap. The energy of an
     unknown cause, and of slow noise beyond its fitted level, is subtracted; that absorbed by parameters is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
-    left, measured = problem.errors(fit.seen), np.array(problem.measured)
+    residual, measured = problem.errors(fit.seen), np.array(problem.measured)
     slow = SlowNoiseOfFit.of_fit(problem, fit)
     noise, slow_residual, explained = slow.noise, slow.left, np.zeros(len(slow.left))
-    if matters(problem, fit, rest):
-        *_, noise, without = slow.with_rest(problem, slow.noise, rest.clearest)
+    if is_predictive(problem, fit, unexplained):
+        *_, noise, without = slow.with_nuisance(problem, slow.noise, unexplained.clearest)
         explained, slow_residual = (slow_residual**2 - without**2).sum(axis=1), without
     expected = noise.energy
     beyond_expected = (slow_residual**2).sum(axis=1) - expected
-    floor, of_sample = left**2, problem.recording_of[problem.bin_of]
+    floor, of_sample = residual**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
         of_bin, at = problem.recording_of == recording, of_sample == recording
         error = noise.energy_error / np.sqrt(of_bin.mean())
@@ -294,14 +295,14 @@ def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
     """
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
-    near = np.abs(time[2:] - time[:-2] - 2.0 * interval) < interval
-    second = second[near]
+    adjacent = np.abs(time[2:] - time[:-2] - 2.0 * interval) < interval
+    second = second[adjacent]
     if len(second) < 4:
         return np.zeros(values.shape[1]), np.inf
     return np.asarray((second**2).mean(axis=0) / 6.0), float(np.sqrt(3.9 / len(second)))
 
 
-def claimed_std(problem: Problem) -> list[Array] | None:
+def reported_std(problem: Problem) -> list[Array] | None:
     """Return the reported standard deviation (3,) m/s of the difference per recording, None if any is missing."""
     found = []
     for recording in problem.recordings:
@@ -314,8 +315,8 @@ def claimed_std(problem: Problem) -> list[Array] | None:
 
 
 def _reported(problem: Problem) -> float | None:
-    claimed = claimed_std(problem)
-    return None if claimed is None else float(np.sqrt(np.mean([np.sum(each**2) for each in claimed])))
+    reported = reported_std(problem)
+    return None if reported is None else float(np.sqrt(np.mean([np.sum(each**2) for each in reported])))
 
 
 # ------------------------------------------------------------------ folds

@@ -42,16 +42,16 @@ class GapPlace:
 def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) -> dict[str, Mask]:
     """Return (M,) bool each, or (F,) per sample: straight, turning, accelerating, slow or fast (terciles)."""
 
-    def of(function: Callable[[EffectInput], Array]) -> Array:
+    def sampled(function: Callable[[EffectInput], Array]) -> Array:
         if per_sample:
             return np.concatenate([function(each.motion) for each in seen])
         return problem.sampled(seen, function)
 
-    speeds = of(lambda motion: motion.speed)
-    change = of(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
+    speeds = sampled(lambda motion: motion.speed)
+    change = sampled(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
     found = {"accelerating": np.abs(change) > ACCELERATING_MPS2}
     if EffectNeeds.ANGULAR_VELOCITY in problem.available:
-        found["turning"] = np.abs(of(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
+        found["turning"] = np.abs(sampled(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
         found["straight"] = ~found["turning"]
     slow, fast = np.quantile(speeds, [1 / 3, 2 / 3])
     if fast - slow > 0.1 * fast:
@@ -129,6 +129,7 @@ def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, ma
 
 
 def _bands(gap: Array, nyquist: float) -> list[tuple[float, float, float]]:
+    """Return (low, high, energy) of a gap (M,) m/s per frequency band, Hz."""
     energy = np.abs(np.fft.rfft(gap)) ** 2
     frequency = np.linspace(0.0, nyquist, len(energy))
     total = max(float(energy.sum()), 1e-300)

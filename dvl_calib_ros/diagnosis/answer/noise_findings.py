@@ -13,12 +13,12 @@ from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.tests import holm
 from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, around
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
-from ..model.claimed_noise import followed
+from ..model.claimed_noise import relative_std
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
-from ..noise.noise_level import claims_of, fit_claims, fit_level, stretches_of
+from ..noise.noise_level import fit_claims, fit_level, log_reported, stretches_of
 from ..noise.noise_model import Arma, Noise
-from .gap_closure import claimed_std, high_frequency_variance
+from .gap_closure import high_frequency_variance, reported_std
 
 # Rate of repeats under the null hypothesis, with a coarse resolution
 CHANCE_OF_REPEAT = 1e-3
@@ -62,10 +62,11 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
 
 
 def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
+    """Test whether outliers are more frequent than normal noise explains."""
     scale = robust_std(innovations)
-    far = (np.abs(innovations) > SETTINGS.outlying * scale).any(axis=1)
-    off = problem.bursts // problem.grids[0].per_bin
-    count, n = int(np.count_nonzero(far)) + off, len(innovations) + off
+    is_outlier = (np.abs(innovations) > SETTINGS.outlying * scale).any(axis=1)
+    excluded = problem.bursts // problem.grids[0].per_bin
+    count, n = int(np.count_nonzero(is_outlier)) + excluded, len(innovations) + excluded
     spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
     if spikes > count:
         count, n = spikes, received
@@ -76,6 +77,7 @@ def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
 
 
 def _stale(problem: Problem) -> NoiseFinding | None:
+    """Test whether repeated velocities are more frequent than chance explains."""
     count = sum(recording.repeats for recording in problem.recordings)
     n = sum(recording.received for recording in problem.recordings)
     if count < 3:
@@ -106,7 +108,7 @@ def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
 def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
     """Return the noise with the colour that interpolation gives to white noise.
 
-    A stream that is `quiet` between its samples retains only low frequencies of its noise, as slow as the vehicle's
+    A stream that is `denoised` between its samples retains only low frequencies of its noise, as slow as the vehicle's
     motion.
     """
     noise, white = fit.noise, replace(fit, noise=fit.noise.white)
@@ -132,20 +134,21 @@ def _time_constant(arma: Arma, interval: float) -> float:
 
 
 def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFinding | None]:
+    """Test whether the noise exceeds the reported one, or depends on speed or turn rate."""
     found: list[NoiseFinding | None] = []
-    claimed = claimed_std(problem)
-    if claimed is not None:
+    reported = reported_std(problem)
+    if reported is not None:
         errors = problem.errors(fit.seen)
         variance, error = high_frequency_variance(problem.sample_time, errors)
-        ratio = float(np.sqrt(variance.sum() / np.mean([np.sum(each**2) for each in claimed])))
+        ratio = float(np.sqrt(variance.sum() / np.mean([np.sum(each**2) for each in reported])))
         error = 0.5 * error
         if ratio > INFLATION:
             p = float(2.0 * normal_sf(np.log(ratio) / error))
             low, high = float(ratio * np.exp(-OF_INTERVAL * error)), float(ratio * np.exp(OF_INTERVAL * error))
             found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
-    names, log_claims = claims_of(problem, fit.seen, fit.noise.rotation)
+    names, log_claims = log_reported(problem, fit.seen, fit.noise.rotation)
     even = innovations * fit.noise.level
-    even = even / followed(log_claims, even, names, stretches_of(problem))
+    even = even / relative_std(log_claims, even, names, stretches_of(problem))
     level = fit_level(problem, fit.seen, even)
     if level is not None and level.p < SETTINGS.robust_level:
         units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}

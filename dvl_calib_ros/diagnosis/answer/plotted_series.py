@@ -13,7 +13,7 @@ from ...effects.base import EffectInput
 from ..fit.gauss_newton import Fit
 from ..model.forward_model import Problem
 from ..model.stream_curve import segments_of
-from ..search.alternative_regressors import FADES_S, faded
+from ..search.alternative_regressors import FADES_S, low_passed
 from ..search.effect_selection import EffectSelection
 from ..search.event_scan import EVENTS
 from ..search.unexplained import Unexplained
@@ -72,7 +72,7 @@ class DiagnosisSeries:
     without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool. traces: by
     effect (F, 3) m/s, as fitted, without the part that misalignment and scale absorb. phi: (3,) rad and scale: (3,),
     calibration, DVL frame; calibration_std: (6,) of both. rest: tests of the residual. measured: (3,) axes that the
-    reference measures. followed: residual against its regressor.
+    reference measures. by_regressor: residual against its regressor.
     """
 
     recordings: tuple[str, ...]
@@ -87,7 +87,7 @@ class DiagnosisSeries:
     calibration_std: Array
     rest: Unexplained
     measured: tuple[bool, bool, bool] = (True, True, True)
-    followed: Followed | None = None
+    by_regressor: RegressorPlot | None = None
 
     @property
     def axes(self) -> dict[str, str]:
@@ -100,20 +100,21 @@ class DiagnosisSeries:
         return tuple(self._twin(index) for index in range(len(self.recordings)) if (self.recording_of == index).any())
 
     def _twin(self, index: int) -> HeldOutTwin:
-        at, held = self.recording_of == index, self.held_out
+        """Return one recording against its simulated DVL."""
+        rows, held_out = self.recording_of == index, self.held_out
         return HeldOutTwin(
             self.recordings[index],
-            self.time[at],
-            segments_of([self.time[at]]),
-            held.before[at],
-            held.after[at],
-            np.sqrt(held.floor[at].mean(axis=0)),
-            {name: mask[at] for name, mask in self.regimes.items() if mask[at].any()},
+            self.time[rows],
+            segments_of([self.time[rows]]),
+            held_out.before[rows],
+            held_out.after[rows],
+            np.sqrt(held_out.floor[rows].mean(axis=0)),
+            {name: mask[rows] for name, mask in self.regimes.items() if mask[rows].any()},
         )
 
 
 def collect_series(
-    selection: EffectSelection, residuals: HeldOutResiduals, rest: Unexplained, covariance: Array
+    selection: EffectSelection, residuals: HeldOutResiduals, unexplained: Unexplained, covariance: Array
 ) -> DiagnosisSeries:
     """Collect the series of a selection and its residual. covariance: (6 + p, 6 + p) of the fit."""
     fitter, fit = selection.fitter, selection.fit
@@ -138,9 +139,9 @@ def collect_series(
         phi=fit.hypothesis.phi,
         scale=fit.hypothesis.scale,
         calibration_std=np.sqrt(np.diag(covariance)[:6]),
-        rest=rest,
+        rest=unexplained,
         measured=problem.measured,
-        followed=what_it_follows(problem, fit, rest.about),
+        by_regressor=residual_by_regressor(problem, fit, unexplained.about),
     )
 
 
@@ -150,39 +151,39 @@ MIN_GROUP = 4
 
 
 @dataclass(frozen=True)
-class Followed:
+class RegressorPlot:
     """Residual against a regressor. label: of the regressor, with unit. axis: x, y or z, of the strongest dependence.
-    at: (M,) regressor. left: (M,) m/s, residual along the axis."""
+    at: (M,) regressor. residual: (M,) m/s, along the axis."""
 
     label: str
     axis: str
     at: Array
-    left: Array
+    residual: Array
 
     def groups(self) -> tuple[Array, Array, Array, Array]:
         """Return group means (G,) of the regressor; mean, standard deviation and standard error (m/s) of residuals."""
         count = max(1, min(GROUPS, len(self.at) // MIN_GROUP))
         parts = np.array_split(np.argsort(self.at, kind="stable"), count)
         at = np.array([self.at[part].mean() for part in parts])
-        mean = np.array([self.left[part].mean() for part in parts])
-        std = np.array([self.left[part].std(ddof=1) if len(part) > 1 else np.nan for part in parts])
+        mean = np.array([self.residual[part].mean() for part in parts])
+        std = np.array([self.residual[part].std(ddof=1) if len(part) > 1 else np.nan for part in parts])
         return at, mean, std, std / np.sqrt([len(part) for part in parts])
 
 
-def what_it_follows(problem: Problem, fit: Fit, about: str | float) -> Followed | None:
-    """Return the residual against its strongest regressor among those of a name. Return None if there is none.
+def residual_by_regressor(problem: Problem, fit: Fit, about: str | float) -> RegressorPlot | None:
+    """Return the residual against the strongest regressor of a group, by the group's name. Return None without any.
 
     Strongest: axis and regressor whose group means scatter most relative to their standard errors.
     """
-    best: tuple[float, Followed] | None = None
+    best: tuple[float, RegressorPlot] | None = None
     names = [name for name, measured in zip("xyz", problem.measured, strict=True) if measured]
     for label, at in _regressors(problem, fit, about).items():
         for axis, name in enumerate(names):
-            followed = Followed(label, name, at, fit.residual[:, axis])
-            _, mean, _, error = followed.groups()
+            by_regressor = RegressorPlot(label, name, at, fit.residual[:, axis])
+            _, mean, _, error = by_regressor.groups()
             scatter = float(np.nanmean((mean / np.maximum(error, 1e-12)) ** 2))
             if best is None or scatter > best[0]:
-                best = scatter, followed
+                best = scatter, by_regressor
     return None if best is None else best[1]
 
 
@@ -198,6 +199,7 @@ def _regressors(problem: Problem, fit: Fit, about: str | float) -> Mapping[str, 
 
 
 def _of_motion(motion: EffectInput, about: str) -> dict[str, Array]:
+    """Return the regressors (M,) of a group by their label with unit."""
     velocity, rotation, rates = motion.velocity_body, motion.rotation_enu_from_body, motion.angular_velocity
     if about in ("speed", "a band of speeds"):
         return {"speed, m/s": motion.speed}
@@ -221,7 +223,7 @@ def _of_motion(motion: EffectInput, about: str) -> dict[str, Array]:
         return {"turn rate, °/s (to port)": np.degrees(rates[:, 2])}
     if rates is not None and about == "turns before":
         turns = np.degrees(rates[:, 2])
-        return {f"turns before, °/s, fading in {s:.0f} s": faded(motion.time, turns, s) for s in FADES_S}
+        return {f"turns before, °/s, fading in {s:.0f} s": low_passed(motion.time, turns, s) for s in FADES_S}
     if rates is not None and about == "roll and pitch rate":
         return {"roll rate, °/s": np.degrees(rates[:, 0]), "pitch rate, °/s": np.degrees(rates[:, 1])}
     return {}

@@ -138,7 +138,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
                 "closure": effect.closure,
                 "p_adjusted": effect.p,
                 **_by_recording(effect),
-                **_combination(effect),
+                **_combination_document(effect),
             }
             for effect in diagnosis.effects
         ],
@@ -165,7 +165,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
             "phi_rad": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[:3], strict=False)},
             "delta_k": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[3:], strict=False)},
         },
-        **({} if diagnosis.dvl is None else {"dvl": _dvl(diagnosis.dvl)}),
+        **({} if diagnosis.dvl is None else {"dvl": _dvl_document(diagnosis.dvl)}),
         "compared_axes": diagnosis.compared_axes,
         "notes": list(diagnosis.notes),
     }
@@ -177,7 +177,8 @@ def _by_recording(effect: FoundEffect) -> dict[str, Any]:
     return {"by_recording": {name: _parameters(values) for name, values in effect.by_recording.items()}}
 
 
-def _combination(effect: FoundEffect) -> dict[str, Any]:
+def _combination_document(effect: FoundEffect) -> dict[str, Any]:
+    """Return plain data of the observable combination of lever arm and clock, empty without one."""
     found = effect.combination
     if found is None:
         return {}
@@ -190,7 +191,8 @@ def _combination(effect: FoundEffect) -> dict[str, Any]:
     return {"combination": known}
 
 
-def _dvl(dvl: DvlSeen) -> dict[str, Any]:
+def _dvl_document(dvl: DvlSeen) -> dict[str, Any]:
+    """Return plain data of the DVL on its vehicle."""
     return {
         "mounting_rpy": list(dvl.mounting_rpy),
         "lever_arm_m": list(dvl.lever_arm),

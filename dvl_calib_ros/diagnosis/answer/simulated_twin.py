@@ -41,10 +41,10 @@ def twins(selection: EffectSelection) -> tuple[Twin, ...]:
     return tuple(found)
 
 
-def with_quiet_reference(problem: Problem) -> Problem:
+def with_denoised_reference(problem: Problem) -> Problem:
     """Remove the noise of every reference at frequencies without motion."""
-    quiet = tuple(replace(one, reference=one.reference.quiet) for one in problem.recordings)
-    return replace(problem, recordings=quiet)
+    denoised = tuple(replace(one, reference=one.reference.denoised) for one in problem.recordings)
+    return replace(problem, recordings=denoised)
 
 
 def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
@@ -86,6 +86,7 @@ def write_twins(folder: Path, twin: Twin) -> None:
 
 
 def _streams(twin: Twin, velocity: Array) -> tuple[list[ImuSample], list[ReferenceSample], list[DvlSample]]:
+    """Return IMU, reference and simulated DVL samples of a twin. velocity: (N, 3) m/s, DVL frame."""
     recording = twin.recording
 
     def stamps(time: Array) -> list[int]:

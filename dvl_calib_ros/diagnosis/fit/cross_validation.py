@@ -50,7 +50,7 @@ def stretch_of(time: Array) -> Integers:
     return np.floor(time / SETTINGS.block).astype(np.intp)
 
 
-def surprise_elsewhere(problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array) -> float:
+def held_out_deviance(problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array) -> float:
     """Return the held-out deviance of a residual (M, A), predicted from other stretches of time.
 
     It accounts for the columns' uncertainty: if the only dive of a run is held out, no other stretch determines an
@@ -58,8 +58,8 @@ def surprise_elsewhere(problem: Problem, noise: Noise, fitted: NuisanceFit, resi
     """
     folds = list(_held_out(problem, noise, fitted, residual))
     held, trained = folds[0]
-    whole = replace(held, gram=held.gram + trained.gram).surprise()
-    return sum(whole - trained.surprise() for _, trained in folds)
+    whole = replace(held, gram=held.gram + trained.gram).marginal_deviance()
+    return sum(whole - trained.marginal_deviance() for _, trained in folds)
 
 
 def _held_out(
@@ -83,7 +83,7 @@ def predictive_gain(problem: Problem, simpler: SlowNoiseOfFit, richer: SlowNoise
     """
     colours = simpler.noise, richer.noise
     worse, better = (
-        min(surprise_elsewhere(problem, colour, each.known, each.residual) + colour.log_size for colour in colours)
+        min(held_out_deviance(problem, colour, each.known, each.residual) + colour.log_size for colour in colours)
         for each in (simpler, richer)
     )
     return worse - better

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...effects.base import Effect
-from ..model.forward_model import Problem, SeenAgain
+from ..model.forward_model import LazySeen, Problem
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, whose_parameters
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
@@ -77,14 +77,14 @@ class Fit:
         """Return derivatives of the residual, (M, A, 6 + p), on demand."""
         return self.made()
 
-    def gain_over(self, rest: Fit) -> float:
+    def gain_over(self, reduced: Fit) -> float:
         """Return the lower bound of the deviance gain over another fit.
 
         Fits with different noise differ in deviance by a normal variable of this size under the null hypothesis.
         """
-        other = self.own_noise - rest.own_noise
-        sure = rest.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
-        return sure - max(rest.of_tails - self.of_tails, 0.0)
+        other = self.own_noise - reduced.own_noise
+        bound = reduced.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
+        return bound - max(reduced.of_tails - self.of_tails, 0.0)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -99,7 +99,7 @@ class Fit:
     @property
     def dof(self) -> float:
         """Return the degrees of freedom of the effects."""
-        return float(self.system.freedom()[6:].sum())
+        return float(self.system.effective_dof()[6:].sum())
 
     def covariance(self, block: NDArray[np.intp]) -> Array:
         """Return the covariance (6 + p, 6 + p) from the noise model or from blocks (M,), whichever is larger.
@@ -117,9 +117,9 @@ class Fit:
     def scores(self, block: NDArray[np.intp]) -> Array:
         """Return sums (B, 6 + p) of whitened columns times residual over blocks (M,)."""
         white = self.noise.whiten(self.columns).reshape(len(block), -1, self.columns.shape[2])
-        left = self.noise.whiten(self.residual).reshape(len(block), -1)
-        each = np.einsum("map,ma->mp", white, left)
-        return np.stack([np.bincount(block, column) for column in each.T], axis=1)
+        residual = self.noise.whiten(self.residual).reshape(len(block), -1)
+        products = np.einsum("map,ma->mp", white, residual)
+        return np.stack([np.bincount(block, column) for column in products.T], axis=1)
 
 
 @dataclass(frozen=True)
@@ -146,15 +146,15 @@ class Fitter:
         return replace(self, held=held, _fits={})
 
     def bursts(self, fit: Fit) -> Mask:
-        """Return (M,) bins with large errors for some seconds, too few for an effect.
+        """Return a mask (M,) of bins in short bursts of large errors, too rare for an effect.
 
         The residual is not whitened: bursts would determine the noise's colour.
         """
         raw = (fit.residual + self.outliers) / fit.noise.level
         size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
         run = np.cumsum(np.diff(size > 0.5 * SETTINGS.outlying, prepend=False))  # odd in the runs, even between them
-        far = np.isin(run, run[size > SETTINGS.outlying])
-        return far & (np.count_nonzero(far) <= RARE * len(far))
+        in_burst = np.isin(run, run[size > SETTINGS.outlying])
+        return in_burst & (np.count_nonzero(in_burst) <= RARE * len(in_burst))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
         """Evaluate a hypothesis; return the evaluation and the residual (M, A)."""
@@ -174,14 +174,15 @@ class Fitter:
         columns = self.columns(hypothesis, seen)
         return _Linearisation(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
 
-    def _white(self, noise: Noise, values: Array) -> Array:
+    def _whiten(self, noise: Noise, values: Array) -> Array:
+        """Whiten values (M, A, ...) without held-out bins."""
         white = noise.whiten(values)
         if self.held is not None:
             white = white[np.repeat(~self.held, self.problem.axes)]
         return white
 
     def _misfit(self, noise: Noise, residual: Array, hypothesis: Hypothesis) -> float:
-        white = self._white(noise, residual)
+        white = self._whiten(noise, residual)
         return float(white @ white + np.sum((hypothesis.vector() / prior_std(hypothesis)) ** 2))
 
     def fit(
@@ -189,18 +190,18 @@ class Fitter:
         start: Hypothesis,
         noise: Noise,
         max_steps: int = MAX_STEPS,
-        only_of_the_day: bool = False,
+        only_own: bool = False,
         fixed: frozenset[str] = frozenset(),
         linearised: _Linearisation | None = None,
         evaluated: Evaluated | None = None,
     ) -> Fit:
-        """Fit a hypothesis under a noise. only_of_the_day: fit parameters per recording only.
+        """Fit a hypothesis under a noise. only_own: fit only the parameters per recording.
 
         fixed: names of effects whose values are fixed. linearised, evaluated: linearisation or evaluation of the
         start, if known.
         """
-        kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
-        kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
+        is_fixed = np.array([True] * 6 + [not each.effect.per_recording for each in start.parameters()]) & only_own
+        is_fixed |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
         if linearised is not None:
             evaluated = linearised.seen, linearised.residual
@@ -209,21 +210,21 @@ class Fitter:
         for _ in range(max_steps):
             linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
             system = linearised.system
-            free = np.flatnonzero(~kept)
-            step = np.zeros(len(kept))
+            free = np.flatnonzero(~is_fixed)
+            step = np.zeros(len(is_fixed))
             step[free] = system.part(free).solution() if len(free) else 0.0
             if misfit - system.misfit(step) < GAINS_NOTHING:
                 break
-            moved, tried = False, step
+            improved, trial_step = False, step
             for _ in range(HALVINGS):
-                trial = hypothesis.moved(tried)
+                trial = hypothesis.moved(trial_step)
                 trial_seen, trial_residual = self.evaluated(trial)
                 trial_misfit = self._misfit(noise, trial_residual, trial)
                 if trial_misfit <= misfit:
-                    moved = True
+                    improved = True
                     break
-                tried = 0.4 * tried
-            if not moved:
+                trial_step = 0.4 * trial_step
+            if not improved:
                 break
             linearised = None
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
@@ -231,9 +232,9 @@ class Fitter:
         columns, plain = linearised.columns, linearised.system
         made: Callable[[], Array] = partial(np.asarray, columns)
         system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
-        free = np.flatnonzero(~kept)
+        free = np.flatnonzero(~is_fixed)
         if len(free):
-            step = np.zeros(len(kept))
+            step = np.zeros(len(is_fixed))
             step[free] = system.part(free).solution()
             last = hypothesis.moved(step)
             last_seen, last_residual = self.evaluated(last)
@@ -243,8 +244,8 @@ class Fitter:
                 made = partial(self.problem.all_columns, hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
-        of_each = own_noise.reshape(len(self.problem.shaken), -1)
-        of_tails = float((np.array(self.problem.tails) - 1.0) @ (of_each**2).sum(axis=1))
+        of_each = own_noise.reshape(len(self.problem.perturbed), -1)
+        of_tails = float((np.array(self.problem.noise_excess) - 1.0) @ (of_each**2).sum(axis=1))
         return Fit(hypothesis, seen, residual, noise, made, system, deviance, own_noise, of_tails)
 
     def _without_own_noise(
@@ -256,28 +257,28 @@ class Fitter:
         in variables).
         """
         gram = system.gram
-        for shaken in self.problem.shaken:
-            seen = shaken.all_seen(hypothesis)
-            other = replace(self, problem=shaken, _fits={})
-            white = self._white(noise, other.columns(hypothesis, seen) - columns)
-            own = self._white(noise, shaken.residual(seen) - residual - self.outliers)
-            joined = np.column_stack([white, -own])
+        for perturbed in self.problem.perturbed:
+            seen = perturbed.all_seen(hypothesis)
+            fitter = replace(self, problem=perturbed, _fits={})
+            white = self._whiten(noise, fitter.columns(hypothesis, seen) - columns)
+            noise_part = self._whiten(noise, perturbed.residual(seen) - residual - self.outliers)
+            joined = np.column_stack([white, -noise_part])
             gram = gram - joined.T @ joined
-        found = replace(system, gram=gram)
-        return found if found.is_definite else system
+        corrected = replace(system, gram=gram)
+        return corrected if corrected.is_definite else system
 
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """Return the whitened contribution (S n,) of simulated velocity noise to a hypothesis' residual (M, A)."""
         white = [
-            self._white(noise, shaken.residual(shaken.all_seen(hypothesis)) - residual)
-            for shaken in self.problem.shaken
+            self._whiten(noise, perturbed.residual(perturbed.all_seen(hypothesis)) - residual)
+            for perturbed in self.problem.perturbed
         ]
         return np.concatenate(white)
 
     def _system(self, noise: Noise, columns: Array, residual: Array, hypothesis: Hypothesis) -> WhitenedLeastSquares:
         """Return the system of the step (6 + p,) from a hypothesis."""
         return WhitenedLeastSquares.of(
-            self._white(noise, columns), -self._white(noise, residual), prior_std(hypothesis), -hypothesis.vector()
+            self._whiten(noise, columns), -self._whiten(noise, residual), prior_std(hypothesis), -hypothesis.vector()
         )
 
     def fit_kept(self, start: Hypothesis, noise: Noise) -> Fit:
@@ -289,23 +290,23 @@ class Fitter:
             for spec in effect.parameters
             if is_time_of_run(spec)
         )
-        of = sorted((effect.name, len(effect.parameters), effect.of_the_day) for effect in start.effects)
-        model = tuple(of), windows
+        effects = sorted((effect.name, len(effect.parameters), effect.per_recording) for effect in start.effects)
+        model = tuple(effects), windows
         key = (id(noise), *model)
         if key not in self._fits:
             nearest, evaluated = start, self.evaluated(start)
             for each in self.problem.fitted.get(model, []):  # optima under other noise are near
-                at_end = self.evaluated(each)
-                if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
-                    nearest, evaluated = each, at_end
-            found = self.fit(nearest, noise, evaluated=evaluated)
-            seen = SeenAgain(self.problem, found.hypothesis)
-            made = partial(self.problem.all_columns, found.hypothesis, seen)
-            self._fits[key] = replace(found, seen=seen, made=made)
+                other = self.evaluated(each)
+                if self._misfit(noise, other[1], each) < self._misfit(noise, evaluated[1], nearest):
+                    nearest, evaluated = each, other
+            fit = self.fit(nearest, noise, evaluated=evaluated)
+            seen = LazySeen(self.problem, fit.hypothesis)
+            columns = partial(self.problem.all_columns, fit.hypothesis, seen)
+            self._fits[key] = replace(fit, seen=seen, made=columns)
             self.problem.fitted[model] = [self._fits[key].hypothesis]
         return self._fits[key]
 
-    def straight_on(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
+    def one_step(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
         """Return the misfit after one linear step, and the step's end; start: a hypothesis with the same evaluation."""
         columns = self.columns(start, fit.seen)
         system = self._system(fit.noise, columns, fit.residual, start)
@@ -317,28 +318,29 @@ class Fitter:
         for step in steps:
             for effect in fit.effects:
                 for spec in (spec for spec in effect.parameters if is_time_of_run(spec)):
-                    fit = self._finer(fit, effect, spec.name, step)
+                    fit = self._refine_event_time(fit, effect, spec.name, step)
         return fit
 
-    def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
-        at_rest: tuple[Fit, float] | None = None
+    def _refine_event_time(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
+        """Move a time of an effect by ± `step` (s), if that lowers the deviance."""
+        converged: tuple[Fit, float] | None = None
         for sign in (-1.0, 1.0):
-            per = fit.values[effect.name]
-            if not all(np.isfinite(each[name]) for each in per):
+            values = fit.values[effect.name]
+            if not all(np.isfinite(each[name]) for each in values):
                 continue
-            moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
-            hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
+            shifted = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in values)
+            hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: shifted})
             linearised = self._linearised(hypothesis, fit.noise)
-            if at_rest is None or at_rest[0] is not fit:
-                at_rest = fit, self._promised(fit)
-            if self._is_surely_worse(hypothesis, linearised, fit.noise, fit.deviance, at_rest[1]):
+            if converged is None or converged[0] is not fit:
+                converged = fit, self._predicted_gain(fit)
+            if self._is_surely_worse(hypothesis, linearised, fit.noise, fit.deviance, converged[1]):
                 continue
             trial = self.fit(hypothesis, fit.noise, 3, linearised=linearised)
             if trial.deviance < fit.deviance:
                 fit = trial
         return fit
 
-    def _promised(self, fit: Fit) -> float:
+    def _predicted_gain(self, fit: Fit) -> float:
         """Return the predicted gain of a linear step from a converged fit, which is not attainable."""
         system = self._system(fit.noise, fit.columns, fit.residual, fit.hypothesis)
         return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
@@ -349,16 +351,16 @@ class Fitter:
         """Return whether a hypothesis, fitted, would have a larger deviance, by one linear step.
 
         The step's predicted deviance is the minimum except for nonlinearity. promised: predicted gain from a nearby
-        converged fit of this deviance, subtracted as unattainable (`_promised`).
+        converged fit of this deviance, subtracted as unattainable (`_predicted_gain`).
         """
         own_noise = self._own_noise(hypothesis, noise, linearised.residual + self.outliers)
-        least = linearised.system.misfit(linearised.system.solution())
-        gained = self._misfit(noise, linearised.residual, hypothesis) - least
-        least -= float(own_noise @ own_noise)
-        if least > deviance + SURELY + BENT * gained:
+        minimum = linearised.system.misfit(linearised.system.solution())
+        gain = self._misfit(noise, linearised.residual, hypothesis) - minimum
+        minimum -= float(own_noise @ own_noise)
+        if minimum > deviance + SURELY + BENT * gain:
             return True
-        alike = min(promised, gained)
-        return least + alike > deviance + 2.0 * SURELY + BENT * (gained - alike)
+        unattainable = min(promised, gain)
+        return minimum + unattainable > deviance + 2.0 * SURELY + BENT * (gain - unattainable)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """Return the time at which an effect begins or ends, with its 95 per cent interval."""

@@ -28,7 +28,7 @@ from .gauss_newton import Fit
 SIMULATED = 12
 
 
-class _OtherWay(Curve):
+class _AkimaCurve(Curve):
     """A curve through the same samples on Akima's cubics, which bend within two samples of a corner."""
 
     @cached_property
@@ -49,22 +49,22 @@ def simulated_recordings(problem: Problem, fit: Fit, count: int) -> Iterator[tup
     rng = np.random.default_rng(0)
     moving = replace(problem, recordings=tuple(map(_moving, problem.recordings)))
     truth = [_reference(moving, fit.hypothesis, index) for index in range(len(problem.recordings))]
-    wanted = float(np.mean(fit.noise.whiten(fit.residual) ** 2))
+    target = float(np.mean(fit.noise.whiten(fit.residual) ** 2))
     share = 1.0
     for number in range(-1, count):
-        drawn = [
+        recordings = [
             _drawn(recording, reference, share, rng)
             for recording, reference in zip(problem.recordings, truth, strict=True)
         ]
-        other = replace(problem, recordings=tuple(drawn))
-        seen = other.all_seen(fit.hypothesis)
-        residual = other.residual(seen)
-        made = float(np.mean(fit.noise.whiten(residual) ** 2))
+        simulated = replace(problem, recordings=tuple(recordings))
+        seen = simulated.all_seen(fit.hypothesis)
+        residual = simulated.residual(seen)
+        achieved = float(np.mean(fit.noise.whiten(residual) ** 2))
         if number < 0:  # a slow stream is rough from turns too
-            share = min(1.0, float(np.sqrt(wanted / max(made, 1e-300))))
+            share = min(1.0, float(np.sqrt(target / max(achieved, 1e-300))))
             continue
-        beyond = np.sqrt(max(0.0, wanted - made))
-        yield other, seen, residual + beyond * fit.noise.unwhiten(rng.standard_normal(residual.size))
+        excess = np.sqrt(max(0.0, target - achieved))
+        yield simulated, seen, residual + excess * fit.noise.unwhiten(rng.standard_normal(residual.size))
 
 
 def _moving(recording: RecordedStreams) -> RecordedStreams:
@@ -73,7 +73,7 @@ def _moving(recording: RecordedStreams) -> RecordedStreams:
     def through(curve: Curve | None) -> Curve | None:
         if curve is None or curve.interval <= FAST_ENOUGH_S or len(curve.time) < 5:
             return curve
-        return _OtherWay(curve.time, curve.values)
+        return _AkimaCurve(curve.time, curve.values)
 
     dvl = recording.dvl.smooth
     return replace(
@@ -82,9 +82,11 @@ def _moving(recording: RecordedStreams) -> RecordedStreams:
 
 
 def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.random.Generator) -> RecordedStreams:
+    """Return a recording with simulated white noise. reference: noise-free. share: of the streams' noise level."""
+
     def noisy(curve: Curve, values: Array) -> Curve:
-        noise = share * curve.noise * curve.loudness * rng.standard_normal(values.shape)
-        return Curve(curve.time, values + noise, curve.claimed, claims=curve.claims)
+        noise = share * curve.noise * curve.relative_noise * rng.standard_normal(values.shape)
+        return Curve(curve.time, values + noise, curve.reported, sample_std=curve.sample_std)
 
     return replace(
         recording,

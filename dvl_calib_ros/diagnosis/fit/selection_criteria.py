@@ -44,7 +44,7 @@ def windows(effect: Effect, seconds: float) -> list[dict[str, float]]:
     return [whole, *(part for part in parts if part != {times[0]: 0.0, times[-1]: seconds})]
 
 
-def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
+def penalty(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
     """Return the deviance that the best of all effects explains under the null with probability `SETTINGS.level`."""
     dof = n_amplitudes(effect, n_recordings)
     return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
@@ -53,7 +53,7 @@ def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0)
 def criterion(fit: Fit, n_effects: int) -> float:
     """Return the deviance plus the price of every effect."""
     n = len(fit.seen)
-    return fit.deviance + sum(price(effect, n_effects, n, times_tried(effect)) for effect in fit.effects)
+    return fit.deviance + sum(penalty(effect, n_effects, n, times_tried(effect)) for effect in fit.effects)
 
 
 def times_tried(effect: Effect) -> float:
@@ -68,8 +68,8 @@ def best_of(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
     """
     scores = [criterion(fit, len(effects)) for fit in fits]
     rank = {name: index for index, name in enumerate(effects)}
-    alike = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + AS_WELL]
-    return min(alike, key=lambda fit: (sum(rank[effect.name] for effect in fit.effects), fit.deviance))
+    equivalent = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + AS_WELL]
+    return min(equivalent, key=lambda fit: (sum(rank[effect.name] for effect in fit.effects), fit.deviance))
 
 
 def fit_without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
@@ -83,16 +83,16 @@ def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
     return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
 
 
-def log_p_in_place(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> float:
-    """Return log p of an effect given all others and unobservable parameters. rest: the fit without it."""
+def log_p_in_place(fitter: Fitter, fit: Fit, reduced: Fit, effect: Effect) -> float:
+    """Return log p of an effect given all others and unobservable parameters. reduced: the fit without it."""
     problem = fitter.problem
-    gain = fit.gain_over(rest) - max(_told_by_unshown(problem, rest) - _told_by_unshown(problem, fit), 0.0)
-    return log_p_value(gain, fit.dof - rest.dof, times_tried(effect))
+    gain = fit.gain_over(reduced) - max(_absorbed(problem, reduced) - _absorbed(problem, fit), 0.0)
+    return log_p_value(gain, fit.dof - reduced.dof, times_tried(effect))
 
 
-def _told_by_unshown(problem: Problem, fit: Fit) -> float:
+def _absorbed(problem: Problem, fit: Fit) -> float:
     """Return the deviance that unobservable parameters would explain in addition to a fit, linearised."""
-    if not problem.lacks_columns(fit.hypothesis):
+    if not problem.has_unobservable(fit.hypothesis):
         return 0.0
     both = NuisanceFit.of_fit(problem, fit).step(fit.noise, fit.residual)
     alone = both.part(np.arange(fit.columns.shape[2]))
@@ -124,8 +124,8 @@ def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:
     """
     block = blocks_of(problem)
     covariance, slow, rng = fit.covariance(block), SlowNoiseOfFit.of_fit(problem, fit), np.random.default_rng(0)
-    taken = slow.noise.taken_by(slow.known.columns, slow.known.std)
-    drawn = np.stack(list(slow.noise.drawn(slow.left, taken, DRAWN, rng)), axis=2)
+    absorbed = slow.noise.absorbed_by(slow.known.columns, slow.known.std)
+    drawn = np.stack(list(slow.noise.drawn(slow.left, absorbed, DRAWN, rng)), axis=2)
     steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
     grown = np.sqrt(np.maximum((steps**2).mean(axis=1) / np.diag(covariance), 1.0))
     return np.asarray(covariance * np.outer(grown, grown)), int(block.max()) + 1
@@ -164,21 +164,21 @@ class NuisanceFit(NamedTuple):
     @staticmethod
     def of(problem: Problem, hypothesis: Hypothesis, seen: Sequence[Seen], columns: Array) -> NuisanceFit:
         """Return columns (M, A, k) of the first k parameters of a hypothesis, and u unobservable ones."""
-        unshown, sizes = problem.unshown_columns(hypothesis, seen)
+        unobservable, sizes = problem.unobservable_columns(hypothesis, seen)
         k, none = columns.shape[2], np.zeros(len(sizes))
         std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
-        return NuisanceFit(np.concatenate([columns, unshown], axis=2), std, centre)
+        return NuisanceFit(np.concatenate([columns, unobservable], axis=2), std, centre)
 
     @staticmethod
     def of_fit(problem: Problem, fit: Fit) -> NuisanceFit:
         """Return all parameters of a fit and unobservable ones."""
         return NuisanceFit.of(problem, fit.hypothesis, fit.seen, fit.columns)
 
-    def and_rest(self, raw: Array, residual: Array) -> NuisanceFit:
+    def and_nuisance(self, raw: Array, residual: Array) -> NuisanceFit:
         """Add columns raw (M, A, c), scaled to unit size, that may explain a residual (M, A)."""
         size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
         # jointly no larger than the residual: stretches without a turn would otherwise not bound them
-        std, none = np.full(raw.shape[2], _likely(raw, residual)), np.zeros(raw.shape[2])
+        std, none = np.full(raw.shape[2], _usual_size(raw, residual)), np.zeros(raw.shape[2])
         columns = np.concatenate([self.columns, raw / size], axis=2)
         return NuisanceFit(columns, np.append(self.std, std), np.append(self.centre, none))
 
@@ -187,7 +187,7 @@ class NuisanceFit(NamedTuple):
         return WhitenedLeastSquares.of(noise.whiten(self.columns), -noise.whiten(residual), self.std, -self.centre)
 
 
-def _likely(raw: Array, residual: Array) -> float:
+def _usual_size(raw: Array, residual: Array) -> float:
     """Return the size of each of columns (M, A, c) of unit size that jointly equal a residual (M, A) in size."""
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
 
@@ -209,7 +209,7 @@ class SlowNoiseOfFit(NamedTuple):
         left, noise = residual, replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
         for _ in range(2):
             left = residual + known.columns @ known.step(noise, residual).solution()
-            noise = noise.refitted(left, taken=noise.taken_by(known.columns, known.std))
+            noise = noise.refitted(left, absorbed=noise.absorbed_by(known.columns, known.std))
         return SlowNoiseOfFit(known, residual, noise, left)
 
     @staticmethod
@@ -221,6 +221,6 @@ class SlowNoiseOfFit(NamedTuple):
         slow: SlowNoiseOfFit = fit.kept["slow noise"]
         return slow
 
-    def with_rest(self, problem: Problem, noise: Noise, columns: Array) -> SlowNoiseOfFit:
+    def with_nuisance(self, problem: Problem, noise: Noise, columns: Array) -> SlowNoiseOfFit:
         """Estimate again with columns (M, A, c) that may explain the residual."""
-        return SlowNoiseOfFit.of(problem, noise, self.known.and_rest(columns, self.residual), self.residual)
+        return SlowNoiseOfFit.of(problem, noise, self.known.and_nuisance(columns, self.residual), self.residual)

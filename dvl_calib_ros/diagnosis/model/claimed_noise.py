@@ -26,7 +26,7 @@ FARTHEST = 4.0
 
 
 @dataclass(frozen=True)
-class Claims:
+class Exponents:
     """Exponents (c,) of reported values and their standard deviations, by name of the stream."""
 
     names: tuple[str, ...]
@@ -34,17 +34,17 @@ class Claims:
     stds: Array
 
     @property
-    def sure(self) -> NDArray[np.bool_]:
+    def is_significant(self) -> NDArray[np.bool_]:
         """Return (c,) whether the noise depends significantly on the reported value."""
         return np.asarray(self.exponents > normal_isf(SETTINGS.robust_level) * self.stds)
 
 
-def differ(log_claims: Array) -> bool:
+def is_informative(log_claims: Array) -> bool:
     """Return whether reported values (M, A) are informative."""
     return bool(np.max(np.std(log_claims, axis=0), initial=0.0) > DIFFER)
 
 
-def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: NDArray[np.intp]) -> Claims:
+def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: NDArray[np.intp]) -> Exponents:
     """Fit log squares of values (M, A) to reported values (M, A, c), each axis about its own mean.
 
     Parameters
@@ -64,15 +64,15 @@ def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: N
     sums = np.stack([np.bincount(number, column) for column in scores.T], axis=1)
     n = len(sums)
     covariance = inverse @ (sums.T @ sums) @ inverse * n / max(n - len(slopes) - 1, 1)
-    return Claims(tuple(names), 0.5 * slopes, 0.5 * np.sqrt(np.maximum(np.diag(covariance), 1e-300)))
+    return Exponents(tuple(names), 0.5 * slopes, 0.5 * np.sqrt(np.maximum(np.diag(covariance), 1e-300)))
 
 
-def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: NDArray[np.intp]) -> Array:
+def relative_std(log_claims: Array, values: Array, names: Sequence[str], stretch: NDArray[np.intp]) -> Array:
     """Return relative standard deviations (M, A) of values (M, A), if significant, from reported ones (M, A, c)."""
     kept = list(range(log_claims.shape[2]))
     while kept:
         found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
-        if found.sure.all():
+        if found.is_significant.all():
             logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, LARGEST)
             return np.asarray(np.exp(np.clip(logarithm, -FARTHEST, FARTHEST)))
         kept.pop(int(np.argmin(found.exponents / found.stds)))
@@ -82,24 +82,24 @@ def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: ND
 # ------------------------------------------------------------------ of one stream
 
 
-def loudness(time: Array, claims: Array | None, differences: Array, weights: Array) -> Array:
+def relative_noise(time: Array, sample_std: Array | None, differences: Array, weights: Array) -> Array:
     """Return the relative standard deviation (N, k) of a stream's samples, as far as reported values predict it.
 
     Parameters
     ----------
     time: (N,) s.
-    claims: (N, k) standard deviations, None without.
+    sample_std: (N, k) standard deviations, None without.
     differences: (N - w + 1, k) of w neighbours, free of motion.
     weights: (w,) of the neighbours in these.
     """
     shape = len(time), differences.shape[1]
-    if claims is None or len(differences) < len(weights) or not differ(np.log(claims)):
+    if sample_std is None or len(differences) < len(weights) or not is_informative(np.log(sample_std)):
         return np.ones(shape)
-    variance = np.stack([np.convolve(column, weights**2, "valid") for column in (claims**2).T], axis=1)
+    variance = np.stack([np.convolve(column, weights**2, "valid") for column in (sample_std**2).T], axis=1)
     middle = time[len(weights) // 2 :][: len(differences)]
     stretch = np.floor((middle - middle[0]) / SETTINGS.block).astype(np.intp)
     found = exponents(["own"], 0.5 * np.log(variance)[:, :, None], differences, stretch)
-    if not found.sure.all():
+    if not found.is_significant.all():
         return np.ones(shape)
-    usual = np.median(claims, axis=0)
-    return np.asarray((claims / usual) ** min(float(found.exponents[0]), LARGEST))
+    median = np.median(sample_std, axis=0)
+    return np.asarray((sample_std / median) ** min(float(found.exponents[0]), LARGEST))

@@ -72,14 +72,14 @@ class _Moved(NamedTuple):
     attitude_stamps: Array
 
 
-class SeenAgain(Sequence[Seen]):
+class LazySeen(Sequence[Seen]):
     """Lazy evaluation of a hypothesis: for hours of data it is large, and most fits never need it."""
 
     def __init__(self, problem: Problem, hypothesis: Hypothesis) -> None:
         self._problem, self._hypothesis = problem, hypothesis
 
     @cached_property
-    def _each(self) -> list[Seen]:
+    def _evaluated(self) -> list[Seen]:
         return self._problem.all_seen(self._hypothesis)
 
     def __len__(self) -> int:
@@ -90,15 +90,15 @@ class SeenAgain(Sequence[Seen]):
     @overload
     def __getitem__(self, at: slice) -> Sequence[Seen]: ...
     def __getitem__(self, at: int | slice) -> Seen | Sequence[Seen]:
-        return self._each[at]
+        return self._evaluated[at]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Recordings to explain. lever_arm: (3,) m, known. grids: per recording. of_axes: axes to compare. bursts: number
-    of samples excluded as instrument errors. shown_turns: (3, 3) projection of φ on the mounting rotations that are
-    observable without a vertical reference; φ is held at zero along others. unshown: unobservable parts of effects,
-    nuisance where the effect is in a hypothesis or on every vehicle."""
+    """Recordings to explain. lever_arm: (3,) m, configured. grids: per recording. of_axes: axes to compare. bursts:
+    number of samples excluded as instrument errors. observable_turns: (3, 3) projection of φ on the mounting rotations
+    that are observable without a vertical reference; φ is zero along others. unobservable: unobservable parts of
+    effects, nuisance parameters if the effect is in a hypothesis or on every vehicle."""
 
     recordings: tuple[RecordedStreams, ...]
     rotation_dvl_from_body: Array
@@ -106,8 +106,8 @@ class Problem:
     grids: tuple[Grid, ...]
     of_axes: tuple[bool, bool, bool] = (True, True, True)
     bursts: int = 0
-    shown_turns: Array = field(default_factory=lambda: np.eye(3), repr=False, compare=False)
-    unshown: tuple[Effect, ...] = ()
+    observable_turns: Array = field(default_factory=lambda: np.eye(3), repr=False, compare=False)
+    unobservable: tuple[Effect, ...] = ()
     # Last fitted hypotheses by effects and times: starting points for further fits
     fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
 
@@ -136,12 +136,12 @@ class Problem:
         """Return (M,) s of all bins since the beginning of their recording."""
         return np.concatenate([grid.bin_time for grid in self.grids])
 
-    def without(self, far: NDArray[np.bool_]) -> Problem:
+    def without(self, excluded: NDArray[np.bool_]) -> Problem:
         """Return the problem without some bins (M,)."""
-        of_sample, ends = far[self.bin_of], np.cumsum([len(grid.stamps) for grid in self.grids])[:-1]
+        of_sample, ends = excluded[self.bin_of], np.cumsum([len(grid.stamps) for grid in self.grids])[:-1]
         grids = tuple(
-            replace(grid, stamps=grid.stamps[~off])
-            for grid, off in zip(self.grids, np.split(of_sample, ends), strict=True)
+            replace(grid, stamps=grid.stamps[~out])
+            for grid, out in zip(self.grids, np.split(of_sample, ends), strict=True)
         )
         return replace(self, grids=grids, bursts=int(of_sample.sum()), fitted={})
 
@@ -204,23 +204,23 @@ class Problem:
         return np.asarray(projection @ np.swapaxes(rotation, 1, 2))
 
     @cached_property
-    def shaken(self) -> tuple[Problem, ...]:
+    def perturbed(self) -> tuple[Problem, ...]:
         """Return the problem with simulated noise in the DVL velocity and then in the reference velocity.
 
         The reference is omitted if the grid uses its own samples: its noise then is the same for all hypotheses.
         """
         rng = np.random.default_rng(0)
-        dvl = [replace(one, dvl=one.dvl.shaken(rng)) for one in self.recordings]
-        reference = [replace(one, reference=one.reference.shaken(rng)) for one in self.recordings]
+        dvl = [replace(one, dvl=one.dvl.perturbed(rng)) for one in self.recordings]
+        reference = [replace(one, reference=one.reference.perturbed(rng)) for one in self.recordings]
         by_dvl = any(grid.clock is ActsOn.DVL_CLOCK for grid in self.grids)
         each = [dvl, reference] if by_dvl else [dvl]
         return tuple(replace(self, recordings=tuple(recordings)) for recordings in each)
 
     @cached_property
-    def tails(self) -> tuple[float, ...]:
-        """Return the variance ratio of actual to simulated noise for each of `shaken`, at least 1."""
-        dvl = max(one.dvl.tails for one in self.recordings)
-        return (dvl, max(one.reference.tails for one in self.recordings))[: len(self.shaken)]
+    def noise_excess(self) -> tuple[float, ...]:
+        """Return the variance ratio of actual to simulated noise for each of `perturbed`, at least 1."""
+        dvl = max(one.dvl.noise_excess for one in self.recordings)
+        return (dvl, max(one.reference.noise_excess for one in self.recordings))[: len(self.perturbed)]
 
     # ------------------------------------------------------------------ the model
 
@@ -230,7 +230,7 @@ class Problem:
         time = self.grids[recording].true_time(injections) if at is None else at
         reference = time + late(injections, ActsOn.REFERENCE_CLOCK, time)
         by_dvl = self.grids[recording].clock is ActsOn.DVL_CLOCK
-        curve = stream.reference.quiet if by_dvl else stream.reference
+        curve = stream.reference.denoised if by_dvl else stream.reference
         g = curve.kept.at("values", reference, lambda: curve(reference))
         moved = self._moved(hypothesis, recording, time)
         rotation = moved.motion.rotation_enu_from_body
@@ -249,7 +249,7 @@ class Problem:
             projection=self._kept_projection(stream, rotation, moved.attitude_stamps),
             change=partial(velocity_change, stream.dvl.smooth, moved.dvl_stamps),
             closely=partial(self._close, hypothesis, recording, time),
-            as_it_is=partial(self._close_as_it_is, hypothesis, recording, time),
+            unsmoothed=partial(self._close_unsmoothed, hypothesis, recording, time),
         )
         if any(each.effect.acts_on is ActsOn.REFERENCE for each in injections):
             error -= found.on_reference(injections)  # in place: `found` keeps its cached `close`
@@ -257,23 +257,23 @@ class Problem:
             error -= lag.of_before(found.motion, error, values)
         return found
 
-    def _moved(self, hypothesis: Hypothesis, recording: int, time: Array, as_it_is: bool = False) -> _Moved:
-        """Return the DVL's motion at true times (F,) s. as_it_is: without smoothing a slow DVL."""
+    def _moved(self, hypothesis: Hypothesis, recording: int, time: Array, unsmoothed: bool = False) -> _Moved:
+        """Return the DVL's motion at true times (F,) s. unsmoothed: without smoothing a slow DVL."""
         stream, injections = self.recordings[recording], hypothesis.injections(recording)
         dvl, attitude = (time + late(injections, clock, time) for clock in (ActsOn.DVL_CLOCK, ActsOn.ATTITUDE_CLOCK))
         rotation, rates = self._oriented(stream, attitude)
         raw, smooth = measured_velocity(stream.dvl, dvl, self.grids[recording].clock is ActsOn.DVL_CLOCK)
-        followed = raw if as_it_is and stream.dvl.interval > FAST_ENOUGH_S else smooth
+        velocity = raw if unsmoothed and stream.dvl.interval > FAST_ENOUGH_S else smooth
         lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
         matrix = hypothesis.body_from_measured(nominal)
-        measured = EffectInput(time, rotate_vectors(matrix, followed), nominal, rotation, rates, stream.frame, 0.0)
+        measured = EffectInput(time, rotate_vectors(matrix, velocity), nominal, rotation, rates, stream.frame, 0.0)
         if any(each.effect.acts_on is ActsOn.MOUNTING for each in injections):
             # a small rotation does not change the speed
             turn = turns(injections, undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)[0])
             matrix = hypothesis.body_from_measured(nominal, turn)
-            measured = replace(measured, velocity_body=rotate_vectors(matrix, followed))
+            measured = replace(measured, velocity_body=rotate_vectors(matrix, velocity))
         at_dvl, of_dvl = undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = undo_effects(injections, motion, ActsOn.MOTION, None)
@@ -285,10 +285,10 @@ class Problem:
         between = self.grids[recording].between(time)
         return between and (self.seen(hypothesis.without_memory, recording, between[0]), between[1])
 
-    def _close_as_it_is(
+    def _close_unsmoothed(
         self, hypothesis: Hypothesis, recording: int, time: Array
     ) -> tuple[EffectInput, NDArray[np.intp]] | None:
-        """Evaluate `Seen.close_as_it_is`. Return None if the times are close already."""
+        """Evaluate `Seen.close_unsmoothed`. Return None if the times are close already."""
         between = self.grids[recording].between(time)
         return between and (self._moved(hypothesis.without_memory, recording, between[0], True).motion, between[1])
 
@@ -354,19 +354,19 @@ class Problem:
             # of one mounting they are linear in the velocity: average it first
             lags = hypothesis.lags(recording)
             if each.body_from_measured.ndim == 2 and all(self.measured) and not lags:
-                parts.append(self._by_calibration(hypothesis, each, grid.averaged(each.measured)))
+                parts.append(self._mounting_columns(hypothesis, each, grid.averaged(each.measured)))
                 continue
             close, own = each.close if lags else (each, slice(None))
-            body = self._by_calibration(hypothesis, close, close.measured)
+            body = self._mounting_columns(hypothesis, close, close.measured)
             parts.append(self._in_bins(grid, lagged_columns(lags, each, close, own, body), each))
         return np.concatenate(parts)
 
-    def _by_calibration(self, hypothesis: Hypothesis, seen: Seen, measured: Array) -> Array:
+    def _mounting_columns(self, hypothesis: Hypothesis, seen: Seen, velocity_dvl: Array) -> Array:
         """Return d e / d (φ, δk), (F, 3, 6), body frame, of DVL velocities (F, 3) m/s in its frame."""
-        columns = np.empty((len(measured), 3, 6))
-        by_turn = columns_by_turn(hypothesis, seen, measured)
-        columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
-        unscaled = measured / (1.0 + hypothesis.scale)
+        columns = np.empty((len(velocity_dvl), 3, 6))
+        by_rotation = columns_by_turn(hypothesis, seen, velocity_dvl)
+        columns[:, :, :3] = by_rotation if all(self.measured) else by_rotation @ self.observable_turns
+        unscaled = velocity_dvl / (1.0 + hypothesis.scale)
         np.multiply(-unscaled[:, None, :], seen.body_from_measured, out=columns[:, :, 3:])
         return columns
 
@@ -385,13 +385,13 @@ class Problem:
                 self._derivatives(hypothesis, close, effect, hypothesis.values[effect.name][recording])
                 for effect in lagging
             ]
-            body = np.concatenate([self._by_calibration(hypothesis, close, close.measured), *of_each], axis=2)
+            body = np.concatenate([self._mounting_columns(hypothesis, close, close.measured), *of_each], axis=2)
             bodies.append(lagged_columns(hypothesis.lags(recording), each, close, own, body))
         joined = self.binned(bodies, seen)
         parts, at = {}, 6
         for effect in lagging:
             p = len(amplitudes(effect))
-            parts[effect.name] = self._of_the_day(effect, joined[:, :, at : at + p])
+            parts[effect.name] = self._columns_per_recording(effect, joined[:, :, at : at + p])
             at += p
         for effect in effects:
             if effect not in lagging:
@@ -400,24 +400,24 @@ class Problem:
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """Return d e / d parameters of an effect about values, (M, A, p); per recording if its parameters are."""
-        per_recording = []
+        columns_of = []
         for recording, each in enumerate(seen):
             lags = hypothesis.lags(recording)
             of_motion = lags if effect.acts_on is not ActsOn.REFERENCE else []
             close, own = each.close if of_motion else (each, slice(None))
             if isinstance(effect, EffectWithMemory):
-                as_it_is, own = each.close_as_it_is
-                body = trace_columns(effect, as_it_is, values[recording])[own]
-                per_recording.append(without_remembered(lags, each, body))
+                unsmoothed, own = each.close_unsmoothed
+                body = trace_columns(effect, unsmoothed, values[recording])[own]
+                columns_of.append(without_remembered(lags, each, body))
             else:
                 body = self._derivatives(hypothesis, close, effect, values[recording])
                 lagging = (
                     lagged_columns(lags, each, close, own, body) if of_motion else without_remembered(lags, each, body)
                 )
-                per_recording.append(lagging)
-        return self._of_the_day(effect, self.binned(per_recording, seen))
+                columns_of.append(lagging)
+        return self._columns_per_recording(effect, self.binned(columns_of, seen))
 
-    def _of_the_day(self, effect: Effect, columns: Array) -> Array:
+    def _columns_per_recording(self, effect: Effect, columns: Array) -> Array:
         """Return columns (M, A, p), or (M, A, r p) for parameters per recording, zero in other recordings."""
         whose, p = whose_parameters(effect, len(self.grids)), columns.shape[2]
         if whose == [None]:
@@ -428,29 +428,29 @@ class Problem:
             found[own, :, number * p : (number + 1) * p] = columns[own]
         return found
 
-    def lacks_columns(self, hypothesis: Hypothesis) -> bool:
-        """Return whether `unshown_columns` of a hypothesis is not empty."""
+    def has_unobservable(self, hypothesis: Hypothesis) -> bool:
+        """Return whether `unobservable_columns` of a hypothesis is not empty."""
         named = {*hypothesis.values, *OF_EVERY}
-        return any(effect.name in named for effect in self.unshown) or not np.allclose(self.shown_turns, np.eye(3))
+        return any(e.name in named for e in self.unobservable) or not np.allclose(self.observable_turns, np.eye(3))
 
-    def unshown_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> tuple[Array, Array]:
+    def unobservable_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> tuple[Array, Array]:
         """Return d e / d unobservable parameters, (M, A, u), and their usual sizes (u,).
 
         They are rotations of the mounting and parts of effects. Each is small, but so is an insignificant effect:
         variance that they explain is not evidence for it.
         """
         parts, sizes = [], []
-        held, turns = np.linalg.eigh(np.eye(3) - self.shown_turns)
-        if (held > 0.5).any():
-            turned = replace(self, shown_turns=np.eye(3)).calibration_columns(hypothesis, seen)[:, :, :3]
-            parts.append(turned @ turns[:, held > 0.5])
+        eigenvalues, turns = np.linalg.eigh(np.eye(3) - self.observable_turns)
+        if (eigenvalues > 0.5).any():
+            by_rotation = replace(self, observable_turns=np.eye(3)).calibration_columns(hypothesis, seen)[:, :, :3]
+            parts.append(by_rotation @ turns[:, eigenvalues > 0.5])
             sizes.append(np.full(parts[-1].shape[2], SETTINGS.prior_angle))
-        for effect in self.unshown:
+        for effect in self.unobservable:
             named = hypothesis.values.get(effect.name)
             if named is None and effect.name not in OF_EVERY:
                 continue
             if isinstance(effect, MountingEffect):
-                parts += self._of_unshown_turns(hypothesis, seen, effect)
+                parts += self._unobservable_turns(hypothesis, seen, effect)
                 sizes += [np.full(parts[-2].shape[2], SETTINGS.prior_angle)]
                 sizes += [np.full(parts[-1].shape[2], 0.5 * SETTINGS.prior_angle**2)]
                 continue
@@ -462,12 +462,12 @@ class Problem:
             return np.zeros((len(self.time), self.axes, 0)), np.zeros(0)
         return np.concatenate(parts, axis=2), np.concatenate(sizes)
 
-    def _of_unshown_turns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect) -> list[Array]:
+    def _unobservable_turns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect) -> list[Array]:
         """Return d e / d unobservable mounting rotations, (M, A, t), and d e / d half their square by recording, (M, A,
         r). The cosine of a 4° rotation scales all velocities of a recording by -0.25 per cent."""
         turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
         slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
-        return [turned, self._of_the_day(effect, slower)]
+        return [turned, self._columns_per_recording(effect, slower)]
 
     def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """Return (M, A) m/s that an effect adds to the residual of a hypothesis without it."""
@@ -481,7 +481,7 @@ class Problem:
         """Return d e / d parameters of an effect, (F, 3, p), body frame."""
         specs = amplitudes(effect)
         if isinstance(effect, ClockEffect):
-            by_late = self._by_late(seen, effect.acts_on)
+            by_late = self._delay_columns(seen, effect.acts_on)
             slopes = [central_difference(spec, values, lambda at: effect.late(seen.motion.time, at)) for spec in specs]
             return np.stack([by_late * slope[:, None] for slope in slopes], axis=2)
         if isinstance(effect, MountingEffect):
@@ -494,7 +494,7 @@ class Problem:
         of_dvl = trace_columns(effect, seen.at_dvl, values)
         return np.asarray(seen.body_from_measured @ self.rotation_dvl_from_body @ of_dvl)
 
-    def _by_late(self, seen: Seen, clock: ActsOn) -> Array:
+    def _delay_columns(self, seen: Seen, clock: ActsOn) -> Array:
         """Return d e / d delay of a clock, (F, 3), m/s per s, body frame."""
         if clock is ActsOn.DVL_CLOCK:
             return rotate_vectors(seen.body_from_measured, seen.rate_of_change)
@@ -513,7 +513,7 @@ def make_problem(
     """Make the problem on bins where all streams are available, at the initial offsets and at none."""
     grids = tuple(make_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
     problem = Problem(tuple(recordings), rotation_dvl_from_body, np.asarray(lever_arm, dtype=float), grids)
-    return problem if problem.measured[2] else replace(problem, shown_turns=_shown_turns(problem))
+    return problem if problem.measured[2] else replace(problem, observable_turns=_observable_turns(problem))
 
 
 # Mounting rotations that act by less than this (m/s RMS) at their prior size are not fitted: they would absorb the
@@ -521,7 +521,7 @@ def make_problem(
 TURN_SHOWN_MPS = 0.002
 
 
-def _shown_turns(problem: Problem) -> Array:
+def _observable_turns(problem: Problem) -> Array:
     """Return the projection (3, 3) of φ on rotations that are observable whatever the scale."""
     columns = problem.calibration_columns(no_effect(), problem.all_seen(no_effect())).reshape(-1, 6)
     if not len(columns):
@@ -529,5 +529,5 @@ def _shown_turns(problem: Problem) -> Array:
     by_turn, by_scale = columns[:, :3], columns[:, 3:]
     by_turn = by_turn - by_scale @ np.linalg.lstsq(by_scale, by_turn, rcond=None)[0]
     squares, turns = np.linalg.eigh(by_turn.T @ by_turn * (problem.axes / len(columns)))
-    shown = turns[:, SETTINGS.prior_angle * np.sqrt(np.maximum(squares, 0.0)) > TURN_SHOWN_MPS]
-    return np.asarray(shown @ shown.T)
+    observable = turns[:, SETTINGS.prior_angle * np.sqrt(np.maximum(squares, 0.0)) > TURN_SHOWN_MPS]
+    return np.asarray(observable @ observable.T)

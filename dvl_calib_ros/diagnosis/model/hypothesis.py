@@ -28,7 +28,7 @@ def amplitudes(effect: Effect) -> list[EffectParameter]:
 
 def whose_parameters(effect: Effect, n_recordings: int) -> list[int | None]:
     """Return recordings with their own parameters for an effect; [None] if all share them."""
-    if not effect.of_the_day or n_recordings == 1:
+    if not effect.per_recording or n_recordings == 1:
         return [None]
     return list(range(1 if effect.relative_to_first else 0, n_recordings))
 
@@ -101,7 +101,7 @@ class Hypothesis:
     def with_effects(self, effects: Sequence[Effect], n: int, start: Mapping[str, tuple[Values, ...]]) -> Hypothesis:
         """Return the hypothesis with other effects for n recordings, with values of `start`, its own or the defaults.
 
-        Missing parameters, such as those of a second clock jump, have their default.
+        Missing parameters, for example of a second clock jump, have their default.
         """
         given = {effect.name: start.get(effect.name) or self.values.get(effect.name) or ({},) * n for effect in effects}
         values = {effect.name: tuple({**effect.defaults, **each} for each in given[effect.name]) for effect in effects}

@@ -47,7 +47,7 @@ TOO_SHORT = 0.5
 UP_TO_S, LONGEST_S = 2.0, 5.0
 
 
-class SetBack(NamedTuple):
+class BackwardStep(NamedTuple):
     """Backward clock step between stamps `before` and `after` (s). by: s; upper bound if unknown."""
 
     before: float
@@ -55,34 +55,34 @@ class SetBack(NamedTuple):
     by: float
 
 
-def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray[np.bool_]]:
+def backward_steps(time: Array, velocity: Array) -> tuple[tuple[BackwardStep, ...], NDArray[np.bool_]]:
     """Find backward steps of a clock, and the samples (N,) outside doubly stamped times.
 
     time: (N,) s, sorted stamps. velocity: (N, 3) m/s of these samples. A backward step of two seconds stamps two
     seconds twice. A driver that requires increasing stamps drops two seconds instead: one short step, of which at most
     one sample is kept. A DVL that pings faster for a while has short steps for longer, and a smooth velocity.
     """
-    once = np.ones(len(time), dtype=bool)
+    is_unique = np.ones(len(time), dtype=bool)
     if len(time) < 4 * FEWEST:
-        return (), once
+        return (), is_unique
     steps = np.diff(time)
-    usual = float(np.median(steps))
-    crowded = time[2:] - time[:-2] < TWO_STEPS * usual
-    bent = np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
-    found = []
-    for first, behind in np.flatnonzero(np.diff(np.pad(crowded, 1).astype(int))).reshape(-1, 2).tolist():
-        inside = float(time[behind + 1] - time[first])
-        is_mixed = np.median(bent[first:behind]) > TO_AND_FRO * np.median(bent)
-        if behind - first >= FEWEST and inside < LONGEST_S and is_mixed:
-            once[first : behind + 2] = False
-            found.append(SetBack(float(time[first]), float(time[behind + 1]), inside))
-    apart = np.abs(steps - usual) / usual
-    odd = np.flatnonzero(apart > np.clip(FAR * np.median(apart), *REGULAR))
-    short = odd[steps[odd] < usual]
-    if not found and len(short) > 0 and len(odd) <= RARE:
-        found = [SetBack(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]
-        once[short[steps[short] < TOO_SHORT * usual] + 1] = False
-    return tuple(found), once
+    interval = float(np.median(steps))
+    crowded = time[2:] - time[:-2] < TWO_STEPS * interval
+    bending = np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
+    events = []
+    for first, end in np.flatnonzero(np.diff(np.pad(crowded, 1).astype(int))).reshape(-1, 2).tolist():
+        duration = float(time[end + 1] - time[first])
+        is_mixed = np.median(bending[first:end]) > TO_AND_FRO * np.median(bending)
+        if end - first >= FEWEST and duration < LONGEST_S and is_mixed:
+            is_unique[first : end + 2] = False
+            events.append(BackwardStep(float(time[first]), float(time[end + 1]), duration))
+    relative = np.abs(steps - interval) / interval
+    odd = np.flatnonzero(relative > np.clip(FAR * np.median(relative), *REGULAR))
+    short = odd[steps[odd] < interval]
+    if not events and len(short) > 0 and len(odd) <= RARE:
+        events = [BackwardStep(float(time[index]), float(time[index + 1]), UP_TO_S) for index in short.tolist()]
+        is_unique[short[steps[short] < TOO_SHORT * interval] + 1] = False
+    return tuple(events), is_unique
 
 
 SECOND_NS = 1_000_000_000
@@ -104,8 +104,8 @@ class RecordedStreams:
     attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of continuous sign. rates: (G, 3) rad/s, body.
     dvl_std, reference_std: (3,) m/s, RMS of reported standard deviations, the reference's in its frame; None if not
     reported. measured: (3,) axes that the reference measures. repeats: number of the `received` DVL samples that equal
-    the previous velocity; spikes: number of outliers removed. registration: initial guess, if known. set_back: backward
-    steps of the DVL's clock.
+    the previous velocity; spikes: number of outliers removed. registration: initial guess, if known.
+    backward_steps: of the DVL's clock.
     """
 
     name: str
@@ -122,7 +122,7 @@ class RecordedStreams:
     spikes: int = 0
     first_ns: int = 0
     registration: Registration | None = None
-    set_back: tuple[SetBack, ...] = ()
+    backward_steps: tuple[BackwardStep, ...] = ()
 
     @property
     def available(self) -> frozenset[EffectNeeds]:
@@ -154,13 +154,14 @@ class RecordedStreams:
         """Return (M, 3) rad/s, body: of the gyroscopes, or of the attitude if these are too slow."""
         rates, attitude = self.rates, self.attitude
         if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
-            own = rates.quiet
+            own = rates.denoised
             return np.asarray(own.kept.at("values", at, lambda: own(at)))
         if attitude is None:
             raise ValueError(f"{self.name}: no angular velocity")
-        oriented = attitude.quiet  # 0.01° of noise at 10 Hz is 0.1°/s
+        oriented = attitude.denoised  # 0.01° of noise at 10 Hz is 0.1°/s
 
         def turning() -> Array:
+            """Return the angular velocity (M, 3) rad/s from the attitude's derivative."""
             q = oriented(at)
             dq = oriented.derivative(np.clip(at, oriented.time[0], oriented.time[-1]))
             square = (q * q).sum(axis=1)[:, None]
@@ -195,9 +196,9 @@ def make_recording(
     axes: As gnss_axes.
     first_ns: Stamp of the DVL's first sample.
     """
-    events, once = set_back(*dvl)
-    if not once.all():
-        dvl, dvl_std = (dvl[0][once], dvl[1][once]), dvl_std if dvl_std is None or dvl_std.ndim == 1 else dvl_std[once]
+    events, kept = backward_steps(*dvl)
+    if not kept.all():
+        dvl, dvl_std = (dvl[0][kept], dvl[1][kept]), dvl_std if dvl_std is None or dvl_std.ndim == 1 else dvl_std[kept]
     time, velocity = dvl
     seconds = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     rate = min(SETTINGS.max_stream_rate, max(SETTINGS.max_points / max(seconds, 1.0), SLOWEST_AVERAGE_HZ))
@@ -206,14 +207,14 @@ def make_recording(
     def clean(stream: tuple[Array, Array] | None, std: Array | None = None) -> Curve | None:
         if stream is None or len(stream[0]) < 2:
             return None
-        return _claiming(stream, std).without_spikes()
+        return _with_reported(stream, std).without_spikes()
 
     def curve(stream: tuple[Array, Array] | None, std: Array | None = None, rate: float = rate) -> Curve | None:
         found = clean(stream, std)
         return None if found is None else found.averaged(rate)
 
     if attitude is not None:
-        attitude = attitude[0], _alike_in_sign(attitude[1])
+        attitude = attitude[0], _continuous_sign(attitude[1])
     without_spikes = clean(dvl, dvl_std)
     spikes = 0 if without_spikes is None else len(time) - len(without_spikes.time)
     dvl_curve = None if without_spikes is None else without_spikes.averaged(rate)
@@ -225,7 +226,7 @@ def make_recording(
     return RecordedStreams(
         name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), _rms(dvl_std), _rms(reference_std),
         _measured_axes(reference[1], _usual(reference_std), axes), repeats, len(time), spikes, first_ns,
-        set_back=events,
+        backward_steps=events,
     )  # fmt: skip
 
 
@@ -235,33 +236,34 @@ def _usual(std: Array | None) -> Array | None:
 
 
 def _rms(std: Array | None) -> Array | None:
-    """Return the RMS (3,) of standard deviations (3,) or (N, 3), without those of unmeasured axes."""
-    usual = _usual(std)
-    if std is None or usual is None or std.ndim == 1:
+    """Return the RMS (3,) of standard deviations (3,) or (N, 3); unmeasured axes are ignored."""
+    median = _usual(std)
+    if std is None or median is None or std.ndim == 1:
         return std
     known = std < SETTINGS.unmeasured_std
     squares = np.where(known, std, 0.0) ** 2
     rms = np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1))
-    return np.where(usual < SETTINGS.unmeasured_std, rms, usual)
+    return np.where(median < SETTINGS.unmeasured_std, rms, median)
 
 
-def _claiming(stream: tuple[Array, Array], std: Array | None) -> Curve:
+def _with_reported(stream: tuple[Array, Array], std: Array | None) -> Curve:
     """Return a curve with reported standard deviations (3,) or (N, 3); missing ones (-1) are the median."""
-    usual = _usual(std)
-    if std is None or usual is None or std.ndim == 1:
+    median = _usual(std)
+    if std is None or median is None or std.ndim == 1:
         return Curve(*stream, std)
-    finite = np.where(np.isfinite(usual), usual, SETTINGS.unmeasured_std)
-    claims = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
-    return Curve(*stream, usual, claims=np.minimum(claims, SETTINGS.unmeasured_std))
+    finite = np.where(np.isfinite(median), median, SETTINGS.unmeasured_std)
+    sample_std = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
+    return Curve(*stream, median, sample_std=np.minimum(sample_std, SETTINGS.unmeasured_std))
 
 
-def _alike_in_sign(quaternions: Array) -> Array:
+def _continuous_sign(quaternions: Array) -> Array:
     turned = np.sign(np.einsum("ni,ni->n", quaternions[1:], quaternions[:-1]))
     signs = np.cumprod(np.concatenate([[1.0], np.where(turned == 0.0, 1.0, turned)]))
     return quaternions * signs[:, None]
 
 
 def _measured_axes(velocity: Array, std: Array | None, axes: str) -> tuple[bool, bool, bool]:
+    """Return the axes that a reference measures, by `gnss_axes` or by its reported σ."""
     if axes != "auto":
         return True, True, axes == "xyz"
     measured = np.ones(3, dtype=bool) if std is None else std < SETTINGS.unmeasured_std
@@ -411,7 +413,7 @@ def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, not
         first_ns=first_ns,
     )
     if twice := len(dvl_stream[0]) - recording.received:
-        when = " and ".join(f"{event.after:.0f} s" for event in recording.set_back)
+        when = " and ".join(f"{event.after:.0f} s" for event in recording.backward_steps)
         notes.append(f"dvl: its clock was set back at {when}; {twice} samples of what it stamped twice are left out")
     return recording
 
@@ -455,6 +457,7 @@ def zeros_while_moving(dvl: SampleBlock, reference: SampleBlock) -> NDArray[np.b
 
 
 def _without_zeros(dvl: SampleBlock, reference: SampleBlock, notes: list[str]) -> SampleBlock:
+    """Remove DVL samples of exactly zero while the reference moves, and note their number."""
     lost = zeros_while_moving(dvl, reference)
     if not lost.any() or lost.all():
         return dvl

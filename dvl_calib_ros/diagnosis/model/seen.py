@@ -21,7 +21,7 @@ class Seen:
     m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame. angles: φ plus rotations of the mounting, rad,
     (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or (F, 3, 3). dvl_stamps, reference_stamps: (F,) s of the
     same times. projection: (F, A, 3) or (1, A, 3) from the body frame to the compared axes. change, closely, as_it_is:
-    evaluate `rate_of_change`, `close` and `close_as_it_is`."""
+    evaluate `rate_of_change`, `close` and `close_unsmoothed`."""
 
     motion: EffectInput
     at_dvl: EffectInput
@@ -34,7 +34,7 @@ class Seen:
     projection: Array
     change: Callable[[], Array] = field(repr=False)
     closely: Callable[[], tuple[Seen, NDArray[np.intp]] | None] = field(repr=False)
-    as_it_is: Callable[[], tuple[EffectInput, NDArray[np.intp]] | None] = field(repr=False)
+    unsmoothed: Callable[[], tuple[EffectInput, NDArray[np.intp]] | None] = field(repr=False)
 
     @cached_property
     def rate_of_change(self) -> Array:
@@ -47,16 +47,16 @@ class Seen:
         return self.closely() or (self, slice(None))
 
     @cached_property
-    def close_as_it_is(self) -> tuple[EffectInput, NDArray[np.intp] | slice]:
+    def close_unsmoothed(self) -> tuple[EffectInput, NDArray[np.intp] | slice]:
         """Return the unsmoothed motion of `close`: smoothing would remove the variation that a filter acts on."""
-        return self.as_it_is() or (self.motion, slice(None))
+        return self.unsmoothed() or (self.motion, slice(None))
 
     def on_reference(self, injections: Sequence[Injection]) -> Array:
         """Return (F, 3) m/s, traces on REFERENCE, body frame."""
         lagging = [each for each in injections if isinstance(each.effect, EffectWithMemory)]
-        if not lagging or self.close_as_it_is[0] is self.motion:
+        if not lagging or self.close_unsmoothed[0] is self.motion:
             return traces(injections, self.motion, ActsOn.REFERENCE)
-        close, own = self.close_as_it_is
+        close, own = self.close_unsmoothed
         found = traces([each for each in injections if each not in lagging], self.motion, ActsOn.REFERENCE)
         return np.asarray(found + traces(lagging, close, ActsOn.REFERENCE)[own])
 
@@ -69,8 +69,9 @@ def measured_velocity(curve: Curve, at: Array, at_samples: bool) -> tuple[Array,
     """Return (F, 3) velocity and smoothed velocity."""
 
     def made() -> tuple[Array, Array]:
+        """Return velocity and smoothed velocity, which are the same array for a denoised curve."""
         smooth = curve.smooth
-        raw = curve if at_samples else curve.quiet
+        raw = curve if at_samples else curve.denoised
         smoothed = smooth(at)
         return smoothed if raw is smooth else raw(at), smoothed
 
@@ -92,15 +93,15 @@ def undo_effects(
     If an effect is not small against the motion, as for a spike of 7 m/s, iterations may diverge. Samples keep their
     last converging iteration.
     """
-    here = [each for each in injections if each.effect.acts_on is acts_on]
-    if not here:
+    of_stage = [each for each in injections if each.effect.acts_on is acts_on]
+    if not of_stage:
         return motion, np.zeros(3)
     after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
     moved_before = np.full(len(after), np.inf)
     for _ in range(PASSES):
-        before, added = added, traces(here, motion, acts_on)
+        before, added = added, traces(of_stage, motion, acts_on)
         added = added if turned is None else rotate_vectors(turned, added)
-        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in here):  # exact
+        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in of_stage):  # exact
             return replace(motion, velocity_body=after - added), added
         if np.array_equal(added, before):
             break

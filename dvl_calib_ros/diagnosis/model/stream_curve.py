@@ -17,7 +17,7 @@ from scipy.interpolate import make_interp_spline
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.streams.outliers import deviation_from_neighbours, neighbours, without_spikes
-from .claimed_noise import loudness
+from .claimed_noise import relative_noise
 from .settings import SETTINGS
 
 # Fewest samples for a spectrum that separates motion from noise; number of bands whose power is averaged
@@ -35,7 +35,7 @@ SURELY_HEAVY = 3.0 * 1.6
 MAX_NEIGHBOUR_PRODUCT = 0.4
 
 
-class Remembered:
+class EvaluationCache:
     """Cache of values at the last few sets of times: fits evaluate the same times repeatedly."""
 
     _LIMIT = 8
@@ -55,16 +55,16 @@ class Remembered:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). claimed: (k,)
+    """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). reported: (k,)
     reported standard deviation. like: curve of the same stream without simulated noise, which defines the noise level.
-    claims: (N, k) standard deviation reported per sample."""
+    sample_std: (N, k) standard deviation reported per sample."""
 
     time: Array
     values: Array
-    claimed: Array | None = None
+    reported: Array | None = None
     like: Curve | None = None
-    claims: Array | None = None
-    kept: Remembered = field(init=False, default_factory=Remembered, repr=False)
+    sample_std: Array | None = None
+    kept: EvaluationCache = field(init=False, default_factory=EvaluationCache, repr=False)
 
     @cached_property
     def interval(self) -> float:
@@ -81,7 +81,7 @@ class Curve:
         return values
 
     @cached_property
-    def quiet(self) -> Curve:
+    def denoised(self) -> Curve:
         """Return the curve without frequencies of pure noise, stretch by stretch.
 
         Noise then is equal between and at samples, and a delay does not gain from it. The sine transform about the line
@@ -93,7 +93,7 @@ class Curve:
             if part.stop - part.start < MIN_SPECTRUM or self.interval > FAST_ENOUGH_S:
                 continue
             spectrum, _ = _sines((self.like or self).values[part])
-            variance = self.noise**2 * (self.loudness[part] ** 2).mean(axis=0)
+            variance = self.noise**2 * (self.relative_noise[part] ** 2).mean(axis=0)
             gain = np.column_stack([_gain(column**2, of) for column, of in zip(spectrum.T, variance, strict=True)])
             own, line = _sines(self.values[part])
             values[part] = line + idst(gain * own, type=2, axis=0, norm="ortho")
@@ -101,9 +101,9 @@ class Curve:
 
     @cached_property
     def smooth(self) -> Curve:
-        """Return the curve for regressors: `quiet`, or for a slow stream each sample on a local cubic."""
+        """Return the curve for regressors: `denoised`, or for a slow stream each sample on a local cubic."""
         if self.interval <= FAST_ENOUGH_S or len(self.time) <= SMOOTH_SAMPLES:
-            return self.quiet
+            return self.denoised
         return Curve(self.time, _on_cubics(self.values))
 
     @cached_property
@@ -128,40 +128,40 @@ class Curve:
             return self.like.roughness
         if len(self.time) < 10:
             return np.zeros(self.values.shape[1])
-        return robust_std(np.diff(self.values, 4, axis=0) / self.loudness[2:-2]) / np.sqrt(70.0)
+        return robust_std(np.diff(self.values, 4, axis=0) / self.relative_noise[2:-2]) / np.sqrt(70.0)
 
     @cached_property
-    def tails(self) -> float:
+    def noise_excess(self) -> float:
         """Return the significant variance ratio of noise without outliers to a usual sample's noise.
 
         1 for normal noise, more for Student's t of few degrees of freedom; 1 for a slow stream, whose turns look alike.
         """
         if self.interval > FAST_ENOUGH_S or len(self.time) < MIN_SPECTRUM:
             return 1.0
-        off = np.diff(self.values, 4, axis=0) / self.loudness[2:-2]
-        std = robust_std(off)
-        off, std = off[:, std > 0.0], std[std > 0.0]
+        deviation = np.diff(self.values, 4, axis=0) / self.relative_noise[2:-2]
+        std = robust_std(deviation)
+        deviation, std = deviation[:, std > 0.0], std[std > 0.0]
         if not len(std):
             return 1.0
-        own = np.sqrt(np.mean((np.clip(off / std, -SETTINGS.outlying, SETTINGS.outlying)) ** 2))
-        return float(np.maximum(own / (1.0 + SURELY_HEAVY / np.sqrt(off.size)), 1.0) ** 2)
+        clipped = np.sqrt(np.mean((np.clip(deviation / std, -SETTINGS.outlying, SETTINGS.outlying)) ** 2))
+        return float(np.maximum(clipped / (1.0 + SURELY_HEAVY / np.sqrt(deviation.size)), 1.0) ** 2)
 
     @cached_property
-    def loudness(self) -> Array:
+    def relative_noise(self) -> Array:
         """Return each sample's noise level (N, k) relative to the usual one, if reported values predict it."""
         if self.like is not None:
-            return self.like.loudness
-        return loudness(self.time, self.claims, np.diff(self.values, 4, axis=0), FOURTH)
+            return self.like.relative_noise
+        return relative_noise(self.time, self.sample_std, np.diff(self.values, 4, axis=0), FOURTH)
 
     def part(self, kept: NDArray[np.bool_]) -> Curve:
         """Return the samples selected by a mask (N,)."""
-        claims = None if self.claims is None else self.claims[kept]
-        return Curve(self.time[kept], self.values[kept], self.claimed, claims=claims)
+        sample_std = None if self.sample_std is None else self.sample_std[kept]
+        return Curve(self.time[kept], self.values[kept], self.reported, sample_std=sample_std)
 
     @cached_property
     def from_neighbours(self) -> Array:
         """Return the deviation (N, k) from the cubic through two neighbours on either side, over the noise level."""
-        return deviation_from_neighbours(self.values) / self.loudness
+        return deviation_from_neighbours(self.values) / self.relative_noise
 
     def without_spikes(self) -> Curve:
         """Reject samples far from their neighbours, which would bend the curve.
@@ -170,7 +170,7 @@ class Curve:
         """
         if self.interval > FAST_ENOUGH_S:
             return self
-        kept = without_spikes(self.values, self.loudness)
+        kept = without_spikes(self.values, self.relative_noise)
         return self if kept.all() else self.part(kept)
 
     @cached_property
@@ -181,21 +181,21 @@ class Curve:
         """
         if self.like is not None:
             return self.like.noise
-        if self.claimed is None or self.interval <= FAST_ENOUGH_S:
+        if self.reported is None or self.interval <= FAST_ENOUGH_S:
             return self.roughness
-        return np.minimum(self.roughness, self.claimed)
+        return np.minimum(self.roughness, self.reported)
 
-    def shaken(self, rng: np.random.Generator) -> Curve:
+    def perturbed(self, rng: np.random.Generator) -> Curve:
         """Return the curve with additional simulated noise of the same size."""
-        noise = self.noise * self.loudness * rng.standard_normal(self.values.shape)
+        noise = self.noise * self.relative_noise * rng.standard_normal(self.values.shape)
         return Curve(self.time, self.values + noise, like=self)
 
     def covers(self, at: Array) -> NDArray[np.bool_]:
         """Return (M,) whether samples lie on both sides within the largest gap."""
         after = np.clip(np.searchsorted(self.time, at), 1, len(self.time) - 1)
-        apart = self.time[after] - self.time[after - 1]
+        gap = self.time[after] - self.time[after - 1]
         inside = (at >= self.time[0]) & (at <= self.time[-1])
-        return inside & (apart <= SETTINGS.max_gap_intervals * self.interval)
+        return inside & (gap <= SETTINGS.max_gap_intervals * self.interval)
 
     def is_complete_at(self, at: Array) -> NDArray[np.bool_]:
         """Return (M,) whether the stream `covers` a time and, if slow, lost no sample there."""
@@ -203,11 +203,11 @@ class Curve:
         if self.interval <= FAST_ENOUGH_S:
             return known
         after = np.clip(np.searchsorted(self.time, at), 1, len(self.time) - 1)
-        apart = (at - self.time[after - 1]) * (self.time[after] - at)
-        return known & (apart <= MAX_NEIGHBOUR_PRODUCT * self.interval**2)
+        product = (at - self.time[after - 1]) * (self.time[after] - at)
+        return known & (product <= MAX_NEIGHBOUR_PRODUCT * self.interval**2)
 
     def averaged(self, rate_hz: float) -> Curve:
-        """Average groups of samples to at most a given rate."""
+        """Return the curve averaged over groups of samples, so that its rate is at most `rate_hz`."""
         every = int(np.ceil(1.0 / (rate_hz * self.interval) - 0.05))
         if every <= 1:
             return self
@@ -215,11 +215,11 @@ class Curve:
         starts = np.flatnonzero(np.diff(group, prepend=-1.0))
         counts = np.diff(np.append(starts, len(self.time)))
         time = np.add.reduceat(self.time, starts) / counts
-        claimed = None if self.claimed is None else self.claimed / np.sqrt(every)
-        claims = self.claims
-        if claims is not None:
-            claims = np.sqrt(np.add.reduceat(claims**2, starts, axis=0)) / counts[:, None]
-        return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], claimed, claims=claims)
+        reported = None if self.reported is None else self.reported / np.sqrt(every)
+        each = self.sample_std
+        if each is not None:
+            each = np.sqrt(np.add.reduceat(each**2, starts, axis=0)) / counts[:, None]
+        return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], reported, sample_std=each)
 
 
 def _on_cubics(values: Array) -> Array:

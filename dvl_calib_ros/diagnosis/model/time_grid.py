@@ -55,11 +55,11 @@ class Grid:
         if len(time) < 2:
             return None
         steps = np.diff(time)
-        usual = float(np.median(steps))
-        parts = min(int(np.ceil(usual / CLOSE_S)), SETTINGS.max_points // len(time))
-        if usual <= FAST_ENOUGH_S or parts < 2:
+        interval = float(np.median(steps))
+        parts = min(int(np.ceil(interval / CLOSE_S)), SETTINGS.max_points // len(time))
+        if interval <= FAST_ENOUGH_S or parts < 2:
             return None
-        of_each = np.where(steps < SETTINGS.max_gap_intervals * usual, parts, 1)
+        of_each = np.where(steps < SETTINGS.max_gap_intervals * interval, parts, 1)
         own = np.concatenate([[0], np.cumsum(of_each)])
         return np.interp(np.arange(own[-1] + 1), own, time), own
 
@@ -75,7 +75,7 @@ class Grid:
 
     @cached_property
     def _least(self) -> Array:
-        """Return the least time (F,) s since the first sample; cached, as it is the same for all hypotheses."""
+        """Return the least time (F,) s since the first sample; cached, because no hypothesis changes it."""
         steps = np.diff(self.stamps, prepend=self.stamps[:1])
         return np.asarray(0.5 * np.cumsum(np.minimum(steps, np.median(steps))))
 
@@ -109,20 +109,20 @@ def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
         complete &= curve.is_complete_at(base.time - base_delay_s + delay_s)
     stamps = base.time[complete]
     true = stamps - base_delay_s
-    known = np.ones(len(true), dtype=bool)
+    valid = np.ones(len(true), dtype=bool)
     for curve, delay_s in others:
-        for at in (base_delay_s - delay_s, -MARGIN_S, MARGIN_S):
-            known &= curve.covers(true + delay_s + at)
+        for shift in (base_delay_s - delay_s, -MARGIN_S, MARGIN_S):
+            valid &= curve.covers(true + delay_s + shift)
     if not by_dvl:  # the DVL has no samples while its clock repeats, whatever its delay
-        for event in recording.set_back:
-            of_dvl, around = true + offsets.dvl, event.by + MARGIN_S
-            known &= (of_dvl < event.before - around) | (of_dvl > event.after + around)
+        for event in recording.backward_steps:
+            dvl_stamps, margin = true + offsets.dvl, event.by + MARGIN_S
+            valid &= (dvl_stamps < event.before - margin) | (dvl_stamps > event.after + margin)
     for oriented in (recording.attitude, recording.rates):
-        for at in (base_delay_s, -MARGIN_S, MARGIN_S):
-            known &= True if oriented is None else oriented.covers(true + at)
+        for shift in (base_delay_s, -MARGIN_S, MARGIN_S):
+            valid &= True if oriented is None else oriented.covers(true + shift)
     breaks = np.flatnonzero(np.diff(stamps) > settings.max_gap_intervals * base.interval) + 1
     kept = []
-    for part in np.split(np.arange(len(true)), np.unique(np.concatenate([breaks, np.flatnonzero(np.diff(known)) + 1]))):
-        if len(part) and known[part[0]]:
-            kept.append(part[: len(part) // per_bin * per_bin])
+    for run in np.split(np.arange(len(true)), np.unique(np.concatenate([breaks, np.flatnonzero(np.diff(valid)) + 1]))):
+        if len(run) and valid[run[0]]:
+            kept.append(run[: len(run) // per_bin * per_bin])
     return Grid(clock, stamps[np.concatenate(kept)] if kept else np.zeros(0), per_bin, base_delay_s)

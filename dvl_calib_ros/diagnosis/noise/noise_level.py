@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.distributions import chi2_sf
 from ...calibration.numerics.frames import Array
 from ...effects.base import EffectNeeds
-from ..model.claimed_noise import Claims, differ, exponents, followed
+from ..model.claimed_noise import Exponents, exponents, is_informative, relative_std
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
@@ -46,87 +46,87 @@ def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Lev
     if not found:
         return None
     log_square = np.log(np.maximum((innovations**2).mean(axis=1), 1e-12))
-    slopes, covariance, wald = _sloped(list(found.values()), log_square)
+    slopes, covariance, wald = _fit_slopes(list(found.values()), log_square)
     p, p_of = float(chi2_sf(wald, len(slopes))), chi2_sf(slopes**2 / np.diag(covariance), 1)
     if p < SETTINGS.robust_level:
-        common = [each for values in found.values() if np.ptp(each := _common(values)) > 0.0]
-        p_common = float(chi2_sf(_sloped(common, log_square)[2], len(common))) if common else 1.0
+        common = [each for values in found.values() if np.ptp(each := _clip_extremes(values)) > 0.0]
+        p_common = float(chi2_sf(_fit_slopes(common, log_square)[2], len(common))) if common else 1.0
         p = p if p_common < SETTINGS.robust_level else p_common
     x = np.column_stack([values - values.mean() for values in found.values()])
     level = np.exp(np.clip(0.5 * x @ slopes, -2.0, 2.0))
     return Level(tuple(found), 0.5 * slopes, p, p_of, level)
 
 
-def _sloped(found: Sequence[Array], log_square: Array) -> tuple[Array, Array, float]:
+def _fit_slopes(found: Sequence[Array], log_square: Array) -> tuple[Array, Array, float]:
     """Return slopes (c,) of log squares (M,) along c covariates (M,), their covariance, and the Wald statistic."""
     x = np.column_stack([np.ones(len(log_square)), *(values - values.mean() for values in found)])
     inverse = np.linalg.pinv(x.T @ x)
     parameters = inverse @ x.T @ log_square
-    left = (log_square - x @ parameters)[:, None] * x
-    covariance = (inverse @ (left.T @ left) @ inverse * len(x) / max(len(x) - x.shape[1], 1))[1:, 1:]  # HC1
+    scores = (log_square - x @ parameters)[:, None] * x
+    covariance = (inverse @ (scores.T @ scores) @ inverse * len(x) / max(len(x) - x.shape[1], 1))[1:, 1:]  # HC1
     slopes = parameters[1:]
     return slopes, covariance, float(slopes @ np.linalg.solve(covariance, slopes))
 
 
-def _common(values: Array) -> Array:
-    """Clip values (M,) to the range without `FEW` extreme rows: these may be quiet by chance and bias a slope."""
+def _clip_extremes(values: Array) -> Array:
+    """Clip values (M,) to the range without `FEW` extreme rows: an accidentally small one biases a slope."""
     ordered = np.sort(values)
     few = min(FEW, (len(values) - 1) // 2)
     return np.clip(values, ordered[few], ordered[-1 - few])
 
 
-def estimated(
-    problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None, columns: Array, std: Array
+def estimate_noise(
+    problem: Problem, seen: Sequence[Seen], residual: Array, rotation: Array | None, columns: Array, std: Array
 ) -> tuple[Noise, Array]:
     """Estimate the noise of a residual (M, A) in a frame, with a significant level, and the winsorised residual.
 
     columns, std: (M, A, p) and (p,) of the fit that the residual is from, which has absorbed some of the noise.
     """
-    noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
+    noise = white_noise(residual, problem.segments, rotation, problem.interval).refitted(residual)
     for _ in range(2):  # colour and absorbed noise depend weakly on each other
-        taken = noise.taken_by(columns, std)
-        noise = noise.refitted(noise.robust(left), taken=taken)
-    names, log_claims = claims_of(problem, seen, rotation)
+        absorbed = noise.absorbed_by(columns, std)
+        noise = noise.refitted(noise.robust(residual), absorbed=absorbed)
+    names, log_claims = log_reported(problem, seen, rotation)
     if names:
-        innovations = noise.whiten(left).reshape(left.shape)
-        noise = replace(noise, level=noise.level * followed(log_claims, innovations, names, stretches_of(problem)))
-        noise = noise.refitted(noise.robust(left), taken=taken)
-    level = fit_level(problem, seen, noise.whiten(left).reshape(left.shape))
+        innovations = noise.whiten(residual).reshape(residual.shape)
+        noise = replace(noise, level=noise.level * relative_std(log_claims, innovations, names, stretches_of(problem)))
+        noise = noise.refitted(noise.robust(residual), absorbed=absorbed)
+    level = fit_level(problem, seen, noise.whiten(residual).reshape(residual.shape))
     if level is not None and level.p < SETTINGS.robust_level:
         noise = replace(noise, level=noise.level * level.values[:, None])
-    robust = noise.robust(left)
-    return noise.refitted(robust, taken=taken), robust
+    robust = noise.robust(residual)
+    return noise.refitted(robust, absorbed=absorbed), robust
 
 
-def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Claims | None:
+def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Exponents | None:
     """Fit innovations (M, A) of constant level to informative reported values. Return None without."""
-    names, log_claims = claims_of(problem, seen, rotation)
+    names, log_claims = log_reported(problem, seen, rotation)
     return exponents(names, log_claims, innovations, stretches_of(problem)) if names else None
 
 
 # ------------------------------------------------------------------ of what is compared
 
 
-def claims_of(problem: Problem, seen: Sequence[Seen], rotation: Array | None) -> tuple[tuple[str, ...], Array]:
+def log_reported(problem: Problem, seen: Sequence[Seen], rotation: Array | None) -> tuple[tuple[str, ...], Array]:
     """Return streams with informative reported values, and their logarithms (M, A, c) in the noise's frame."""
     names, columns = [], []
     for name in ("dvl", "reference"):
-        each = _of_stream(problem, seen, rotation, name)
-        if each is not None and differ(each):
+        each = _log_reported_std(problem, seen, rotation, name)
+        if each is not None and is_informative(each):
             names.append(name)
             columns.append(each)
     return tuple(names), np.stack(columns, axis=2) if columns else np.zeros((len(problem.time), problem.axes, 0))
 
 
-def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, name: str) -> Array | None:
+def _log_reported_std(problem: Problem, seen: Sequence[Seen], rotation: Array | None, name: str) -> Array | None:
     """Return the log standard deviation (M, A). Return None if a recording has none, or all are equal."""
-    given = [(each.dvl if name == "dvl" else each.reference).claims for each in problem.recordings]
-    claims = [each for each in given if each is not None and len(each)]
-    if len(claims) < len(given) or all(bool((each == claims[0][0]).all()) for each in claims):
+    given = [(each.dvl if name == "dvl" else each.reference).sample_std for each in problem.recordings]
+    sample_std = [each for each in given if each is not None and len(each)]
+    if len(sample_std) < len(given) or all(bool((each == sample_std[0][0]).all()) for each in sample_std):
         return None
     parts = []
     start = 0
-    for recording, grid, each, own in zip(problem.recordings, problem.grids, seen, claims, strict=True):
+    for recording, grid, each, own in zip(problem.recordings, problem.grids, seen, sample_std, strict=True):
         curve, stamps = (
             (recording.dvl, each.dvl_stamps) if name == "dvl" else (recording.reference, each.reference_stamps)
         )

@@ -152,6 +152,7 @@ class Noise:
         return None if self.rotation is None else self.rotation / self.level[:, :, None]
 
     def _scaled(self, values: Array) -> Array:
+        """Divide values (M, A, ...) by the noise level, in the frame of the noise."""
         if self._levelled is None:
             return values / self.level.reshape(*self.level.shape, *[1] * (values.ndim - 2))
         if values.ndim == 2:
@@ -159,21 +160,21 @@ class Noise:
         return self._levelled @ values  # a fifth of einsum's time for several columns
 
     def refitted(
-        self, residual: Array, orders: Sequence[tuple[int, int]] = ORDERS, taken: Array | None = None
+        self, residual: Array, orders: Sequence[tuple[int, int]] = ORDERS, absorbed: Array | None = None
     ) -> Noise:
         """Fit the ARMA of each axis to a residual (M, A), of the order with the least BIC.
 
-        taken: (A, F) share of the noise that a fit has absorbed (`taken_by`); None: nothing.
+        absorbed: (A, F) share of the noise that a fit has absorbed (`absorbed_by`); None: nothing.
         """
         scaled = self._scaled(residual)
-        each: Sequence[Array | None] = [None] * len(self.axes) if taken is None else list(taken)
+        each: Sequence[Array | None] = [None] * len(self.axes) if absorbed is None else list(absorbed)
         axes = tuple(
             _fit_arma(column, self.segments, self.memory, orders, of_it)
             for column, of_it in zip(scaled.T, each, strict=True)
         )
         return replace(self, axes=axes)
 
-    def taken_by(self, columns: Array, std: Array) -> Array:
+    def absorbed_by(self, columns: Array, std: Array) -> Array:
         """Return the share (A, M // 2 + 1) of noise, by axis and frequency, absorbed by a fit of columns (M, A, p).
 
         std: (p,) of the fit's prior. Slow noise is absorbed most. Uncorrected, the noise is too white: slow effects
@@ -192,10 +193,10 @@ class Noise:
         return np.clip(0.5 * (power[:, half] + power[:, -half]), 0.0, MOST_TAKEN)
 
     @property
-    def fading(self) -> int:
+    def memory_samples(self) -> int:
         """Return the number of samples in which whitened values fade to `FADED` after the last that is not zero."""
-        most = max(abs(arma.ma) for arma in self.axes)
-        return 1 + (int(np.log(FADED) / np.log(most)) if most else 0)
+        largest = max(abs(arma.ma) for arma in self.axes)
+        return 1 + (int(np.log(FADED) / np.log(largest)) if largest else 0)
 
     @property
     def is_coloured(self) -> bool:
@@ -236,15 +237,15 @@ class Noise:
         )
         return replace(self, axes=axes)
 
-    def drawn(self, residual: Array, taken: Array, count: int, rng: np.random.Generator) -> Iterator[Array]:
+    def drawn(self, residual: Array, absorbed: Array, count: int, rng: np.random.Generator) -> Iterator[Array]:
         """Yield `count` simulated residuals (M, A) under colours drawn from their posterior, given a residual (M, A).
 
-        Few independent values of slow noise determine its memory, and a mean of noise varies with it. taken: (A, F),
-        from `taken_by`.
+        Few independent values of slow noise determine its memory, and a mean of noise varies with it. absorbed: (A, F),
+        from `absorbed_by`.
         """
         each = [
             [spectrum.arma(*drawn, series, self.segments) for drawn in spectrum.drawn(self.memory, count, rng)]
-            for series, lost in zip(self._scaled(residual).T, taken, strict=True)
+            for series, lost in zip(self._scaled(residual).T, absorbed, strict=True)
             for spectrum in [_spectrum(series, lost)]
         ]  # fmt: skip
         for axes in zip(*each, strict=True):
@@ -274,14 +275,14 @@ class Noise:
         beyond = np.zeros_like(scaled)
         for _ in range(WINSORISED_TIMES):
             cleaned = scaled - beyond * stds
-            off = beyond + np.stack(
+            deviation = beyond + np.stack(
                 [arma.deviations(series, self.segments) for arma, series in zip(self.axes, cleaned.T, strict=True)], 1
             )
-            scale = robust_std(off)
-            near = np.mean(np.abs(off) < HUBER * scale, axis=0)
-            beyond = off - np.clip(off, -HUBER * scale, HUBER * scale)
-        pseudo = (scaled - beyond * stds) / np.maximum(near, MOST_NEAR)
-        return self._unscaled(np.where(near > MOST_NEAR, pseudo, scaled))
+            scale = robust_std(deviation)
+            share_within = np.mean(np.abs(deviation) < HUBER * scale, axis=0)
+            beyond = deviation - np.clip(deviation, -HUBER * scale, HUBER * scale)
+        pseudo = (scaled - beyond * stds) / np.maximum(share_within, MOST_NEAR)
+        return self._unscaled(np.where(share_within > MOST_NEAR, pseudo, scaled))
 
 
 def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None, interval: float = 1.0) -> Noise:
@@ -302,16 +303,16 @@ def _fit_arma(
     segments: Sequence[slice],
     memory: float,
     orders: Sequence[tuple[int, int]],
-    taken: Array | None = None,
+    absorbed: Array | None = None,
 ) -> Arma:
     """Fit ARMA(1, 1) or less, of least BIC, by Whittle's likelihood restricted to noise that is not absorbed.
 
     With g the spectrum over that of its innovations, and k the share of each frequency that a fit has left, n mean(k)
     log(mean(periodogram / g) / mean(k)) + n mean(k log g) is the deviance; the mean of log g is 0.
     """
-    spectrum, best = _spectrum(series, taken), (np.inf, 0.0, 0.0)
+    spectrum, best = _spectrum(series, absorbed), (np.inf, 0.0, 0.0)
     for p, q in orders:
-        deviance, ar, ma = spectrum.searched(memory, p, q)
+        deviance, ar, ma = spectrum.best_arma(memory, p, q)
         best = min(best, (deviance + (p + q) * np.log(len(series)), ar, ma))
     return spectrum.arma(*best[1:], series, segments)
 
@@ -352,7 +353,7 @@ class _Spectrum:
         value = self.n * (self.left * np.log(np.maximum(mean, 1e-300) / self.left) + logarithm)
         return np.asarray(np.where(ars + mas >= -1e-12, value, np.inf))
 
-    def searched(self, memory: float, p: int, q: int) -> tuple[float, float, float]:
+    def best_arma(self, memory: float, p: int, q: int) -> tuple[float, float, float]:
         """Return deviance, ar and ma of the best ARMA(p, q), by a grid search refined about its best point."""
         bound = float(np.arctanh(memory))
         centre, reach = np.zeros(2), np.array([bound if p else 0.0, MA_REACH if q else 0.0])
@@ -379,21 +380,21 @@ class _Spectrum:
         return [(float(ars[i % ars.size]), float(mas[i // ars.size])) for i in at]
 
 
-def _spectrum(series: Array, taken: Array | None) -> _Spectrum:
-    """Return the spectrum of a series (n,): means over bands. taken: (n // 2 + 1,) share that a fit has absorbed."""
+def _spectrum(series: Array, absorbed: Array | None) -> _Spectrum:
+    """Return the spectrum of a series (n,): means over bands. absorbed: (n // 2 + 1,) share that a fit has absorbed."""
     power = np.abs(np.fft.rfft(series)[1:]) ** 2 / len(series)
     frequency = np.pi * np.arange(1, len(power) + 1) / max(len(power), 1)
     # the lowest frequencies unaveraged: colour is there
     edges = np.unique(np.concatenate([np.arange(min(60, len(power))), np.linspace(0, len(power), MAX_FREQUENCIES)]))
     starts = np.unique(edges.astype(int))[:-1]
     counts = np.diff(np.append(starts, len(power)))
-    lost = np.zeros_like(power) if taken is None else taken[1:]
+    lost = np.zeros_like(power) if absorbed is None else absorbed[1:]
     frequency, power, lost = (np.add.reduceat(each, starts) / counts for each in (frequency, power, lost))
     share = counts / counts.sum()
     return _Spectrum(len(series), frequency, share, power * share, lost * share)
 
 
 def _ratio(ar: Array, ma: float) -> float:
-    """Return the standard deviation of the noise over that of its innovations."""
+    """Return the standard deviation of the noise divided by the standard deviation of its innovations."""
     a = float(ar[0]) if len(ar) else 0.0
     return float(np.sqrt(1.0 + (a + ma) ** 2 / (1.0 - a**2)))

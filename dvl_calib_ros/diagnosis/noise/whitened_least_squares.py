@@ -38,9 +38,9 @@ class WhitenedLeastSquares:
 
     @staticmethod
     def of(columns: Array, target: Array, std: Array, centre: Array) -> WhitenedLeastSquares:
-        """Make the system of whitened columns (m, n) and target (m,)."""
-        along = columns.T @ target
-        gram = np.block([[columns.T @ columns, along[:, None]], [along, target @ target]])
+        """Return the system of whitened columns (m, n) and target (m,). std, centre: (n,) of the parameters' prior."""
+        xty = columns.T @ target
+        gram = np.block([[columns.T @ columns, xty[:, None]], [xty, target @ target]])
         return WhitenedLeastSquares(gram, std, centre)
 
     def part(self, at: NDArray[np.intp]) -> WhitenedLeastSquares:
@@ -81,7 +81,7 @@ class WhitenedLeastSquares:
         """Return the objective at x (n,)."""
         return self.squares(x) + float(np.sum(((x - self.centre) / self.std) ** 2))
 
-    def surprise(self) -> float:
+    def marginal_deviance(self) -> float:
         """Return -2 log marginal likelihood of the target, without constants and the prior's determinant."""
         return self.misfit(self.solution()) + float(np.linalg.slogdet(self._normal)[1])
 
@@ -89,7 +89,7 @@ class WhitenedLeastSquares:
         """Return the covariance (n, n) of the solution, for noise of unit variance."""
         return np.asarray(np.linalg.inv(self._normal))
 
-    def freedom(self) -> Array:
+    def effective_dof(self) -> Array:
         """Return the degrees of freedom (n,) per parameter, less than one where the prior contributes."""
         return np.asarray(1.0 - np.diag(self.covariance()) / self.std**2)
 
@@ -107,24 +107,24 @@ class ScoreTest:
     """Normal equations of columns for a whitened series, orthogonal to a basis.
 
     Basis and series may end with prior rows, which the columns lack. gram: (c, c) of unit columns after projection.
-    along: (c,) products with the series. has: (c,) whether a column exceeds rounding after projection.
+    along: (c,) products with the series. nonzero: (c,) whether a column exceeds rounding after projection.
     """
 
     gram: Array
     along: Array
-    has: NDArray[np.bool_]
+    nonzero: NDArray[np.bool_]
 
     @staticmethod
     def of(q: Array, white_columns: Array, white: Array, first: int = 0) -> ScoreTest:
         """Test whitened columns (m, c), zero but from row `first` on, beside an orthonormal basis q for a series."""
         rows = slice(first, first + len(white_columns))
-        known, square = q[rows].T @ white_columns, white_columns.T @ white_columns
-        left = square - known.T @ known
-        before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, left))
-        has = after > 0.02 * np.maximum(before, 1e-300)
-        size = np.where(has, after, 1.0)
-        along = white_columns.T @ white[rows] - known.T @ (q.T @ white)
-        return ScoreTest(left / np.outer(size, size), along / size, has)
+        explained, square = q[rows].T @ white_columns, white_columns.T @ white_columns
+        scatter = square - explained.T @ explained
+        before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, scatter))
+        nonzero = after > 0.02 * np.maximum(before, 1e-300)
+        size = np.where(nonzero, after, 1.0)
+        along = white_columns.T @ white[rows] - explained.T @ (q.T @ white)
+        return ScoreTest(scatter / np.outer(size, size), along / size, nonzero)
 
     def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
         """Return the energy that columns `at` explain jointly, and their rank."""
@@ -133,13 +133,13 @@ class ScoreTest:
 
     def energies(self, groups: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
         """Return the energy and rank (K,) of each group of columns (K, c), see `energy`."""
-        has = self.has[groups]
+        nonzero = self.nonzero[groups]
         gram = self.gram[groups[:, :, None], groups[:, None, :]]
-        squares, directions = np.linalg.eigh(np.where(has[:, :, None] & has[:, None, :], gram, 0.0))
-        apart = squares > INDEPENDENT**2
-        along = product(directions.swapaxes(1, 2), np.where(has, self.along[groups], 0.0))
-        energies = np.where(apart, along**2 / np.where(apart, squares, 1.0), 0.0)
-        return energies.sum(axis=1), np.count_nonzero(apart, axis=1)
+        squares, directions = np.linalg.eigh(np.where(nonzero[:, :, None] & nonzero[:, None, :], gram, 0.0))
+        independent = squares > INDEPENDENT**2
+        projected = product(directions.swapaxes(1, 2), np.where(nonzero, self.along[groups], 0.0))
+        energies = np.where(independent, projected**2 / np.where(independent, squares, 1.0), 0.0)
+        return energies.sum(axis=1), np.count_nonzero(independent, axis=1)
 
     def log_p(self, groups: NDArray[np.intp]) -> Array:
         """Return log p (K,) of the energy that each group of columns (K, c) explains jointly."""

@@ -30,6 +30,7 @@ def dictionary(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
 
 
 def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
+    """Return functions (M, c) of speed, acceleration, turn rate and time by name."""
     motion = seen.motion
     velocity, speed = motion.velocity_body, motion.speed
     acceleration = np.gradient(velocity[:, 0], motion.time)
@@ -47,9 +48,9 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
         rotation = motion.rotation_enu_from_body
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         roll, pitch = rotation[:, 2, 1], -rotation[:, 2, 0]
-        once = np.column_stack([np.cos(yaw), np.sin(yaw)])
+        one_cycle = np.column_stack([np.cos(yaw), np.sin(yaw)])
         more = [wave(n * yaw) for n in range(2, HEADING_HARMONICS + 1) for wave in (np.cos, np.sin)]
-        found["heading"] = np.column_stack([once, once * s[:, None], *more])
+        found["heading"] = np.column_stack([one_cycle, one_cycle * s[:, None], *more])
         found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
         steps = np.clip(np.diff(motion.time, prepend=motion.time[0]), 0.0, 10.0)
         up = np.einsum("ni,ni->n", rotation[:, 2], velocity)
@@ -58,8 +59,8 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
         rate = motion.angular_velocity
         turning = rate[:, 2]
         found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
-        fading = [faded(motion.time, turning, seconds) for seconds in FADES_S]
-        found["turns before"] = np.column_stack([*fading, _side_of_last_turn(turning)])
+        turn_memories = [low_passed(motion.time, turning, seconds) for seconds in FADES_S]
+        found["turns before"] = np.column_stack([*turn_memories, _side_of_last_turn(turning)])
         found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
     return {name: grid.averaged(values) for name, values in found.items()}
 
@@ -68,7 +69,7 @@ def _spread(speed: Array) -> float:
     return max(float(np.quantile(speed, 0.99) - np.quantile(speed, 0.01)), 1e-3)
 
 
-def faded(time: Array, values: Array, seconds: float) -> Array:
+def low_passed(time: Array, values: Array, seconds: float) -> Array:
     """Return (N,) values (N,) low-pass filtered with a time constant."""
     steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
     decay = np.exp(-steps / seconds)

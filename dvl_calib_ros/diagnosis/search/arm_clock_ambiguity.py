@@ -43,7 +43,7 @@ class Combination:
 
 
 @dataclass(frozen=True)
-class OpenArm:
+class ArmAmbiguity:
     """Ambiguity of arm and reference clock: change (m) of arm parameters per second of delay; σ (s) of the delay."""
 
     by: Mapping[str, float]
@@ -57,13 +57,13 @@ def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, t
     """
     own = [fit.values.get(LAG, ()), fit.values.get(REFERENCE_CLOCK, ())]
     each = [[next(iter(values.values())) for values in per] or [0.0] * len(fit.seen) for per in own]
-    late = [lag + delay for lag, delay in zip(*each, strict=True)]
-    if min(late) < LAG_FROM_S or not any(own):
+    delays = [lag + delay for lag, delay in zip(*each, strict=True)]
+    if min(delays) < LAG_FROM_S or not any(own):
         return []
-    told = {LAG: "time_constant_s", REFERENCE_CLOCK: "seconds"}
+    keys = {LAG: "time_constant_s", REFERENCE_CLOCK: "seconds"}
     return [
-        {name: tuple({key: seconds} for seconds in late)}
-        for name, key in told.items()
+        {name: tuple({key: seconds} for seconds in delays)}
+        for name, key in keys.items()
         if name in effects and {name} != set(LAG_OR_DELAY) & set(fit.values)
     ]
 
@@ -84,12 +84,12 @@ def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) ->
 
     An error of metres in the height rotates the rest of the arm. effects: with observable parameters.
     """
-    shown = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
+    observable = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
     stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
     known = np.min(stds, axis=0) < OPEN_M if stds else np.zeros(3, dtype=bool)
     arm = np.median([guess.lever_arm for guess in guesses], axis=0)
     return {
-        name: value if name in shown or is_known else 0.0
+        name: value if name in observable or is_known else 0.0
         for name, value, is_known in zip(ARM_PARAMETERS, arm.tolist(), known.tolist(), strict=True)
     }
 
@@ -103,20 +103,20 @@ def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: M
     own = [name for name in TWO_CLOCKS if name in present]
     if not own or ARM not in effects or not is_open(guesses):
         return fit
-    shown = {name for each in guesses if each.registration is not None for name in each.registration.offsets}
-    clocks = [name for name in TWO_CLOCKS if name in shown] or own
-    if not shown <= {*TWO_CLOCKS} or {*clocks, ARM} == {*own, *(name for name in present if name == ARM)}:
+    registered = {name for each in guesses if each.registration is not None for name in each.registration.offsets}
+    clocks = [name for name in TWO_CLOCKS if name in registered] or own
+    if not registered <= {*TWO_CLOCKS} or {*clocks, ARM} == {*own, *(name for name in present if name == ARM)}:
         return fit
-    rest = [effect for effect in fit.effects if effect.name not in (*TWO_CLOCKS, ARM)]
+    others = [effect for effect in fit.effects if effect.name not in (*TWO_CLOCKS, ARM)]
     start: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         DVL_CLOCK: tuple({"seconds": each.offsets.dvl} for each in guesses),
         REFERENCE_CLOCK: tuple({"seconds": each.offsets.reference} for each in guesses),
     }
-    wanted = [*rest, effects[ARM], *(effects[name] for name in clocks if name in effects)]
-    if len(wanted) > SETTINGS.max_effects:
+    effects_to_fit = [*others, effects[ARM], *(effects[name] for name in clocks if name in effects)]
+    if len(effects_to_fit) > SETTINGS.max_effects:
         return fit
-    found = fitter.fit_kept(fit.hypothesis.with_effects(wanted, len(guesses), start), fit.noise)
+    found = fitter.fit_kept(fit.hypothesis.with_effects(effects_to_fit, len(guesses), start), fit.noise)
     return found if found.deviance < fit.deviance + SETTINGS.indistinguishable else fit
 
 
@@ -126,11 +126,11 @@ def with_clocks(
     guesses: Sequence[FirstGuess],
     effects: Mapping[str, Effect],
     block: Index,
-    opened: OpenArm | None,
+    trade_off: ArmAmbiguity | None,
 ) -> Fit | None:
-    """Return a fit with both clocks in addition, if part of the lever arm is equally likely theirs; else the fit.
+    """Return a fit with both clock offsets, if they explain part of the lever arm equally well; else the fit.
 
-    Return None where arm and clock are inseparable. block: (M,) of each bin, for σ. opened: from `opened_arm`; if
+    Return None where arm and clock are inseparable. block: (M,) of each bin, for σ. trade_off: from `arm_ambiguity`; if
     given, a part that changes significantly with free clocks is ambiguous as well.
 
     At 0.87 m/s, a DVL 0.3 m astern and a compass delay of 0.35 s differ only while the boat slows down. A model without
@@ -141,34 +141,34 @@ def with_clocks(
     if ARM not in present or not clocks or not is_open(guesses):
         return fit
     joint = fitter.fit_kept(fit.hypothesis.with_effects([*fit.effects, *clocks], len(fit.seen), {}), fit.noise)
-    if opened is not None and joint.deviance > fit.deviance + SETTINGS.indistinguishable:
+    if trade_off is not None and joint.deviance > fit.deviance + SETTINGS.indistinguishable:
         return None
     (own, own_std), (free, free_std) = (_arm_of(each, block) for each in (fit, joint))
     was_shown, is_shown = np.abs(own) > OF_INTERVAL * own_std, np.abs(free) > OF_INTERVAL * free_std
     by_chance = np.sqrt(np.maximum(free_std**2 - own_std**2, 0.0))  # change if no clock is delayed
-    is_another = ~is_shown | ((opened is not None) & (np.abs(free - own) > OF_INTERVAL * by_chance))
+    is_another = ~is_shown | ((trade_off is not None) & (np.abs(free - own) > OF_INTERVAL * by_chance))
     if bool((was_shown & is_another & (free_std > 2.0 * own_std)).any()):
         return joint
-    return None if opened is not None and bool((was_shown & (free_std > AS_ONE * own_std)).any()) else fit
+    return None if trade_off is not None and bool((was_shown & (free_std > AS_ONE * own_std)).any()) else fit
 
 
 def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
     """Return the lever arm's parameters (p,) and standard deviations (p,) from blocks."""
-    at = [*_places(fit, ARM).values()]
+    at = [*_indices(fit, ARM).values()]
     return fit.hypothesis.vector()[at], np.sqrt(np.diag(fit.covariance(block))[at])
 
 
-def opened_arm(guesses: Sequence[FirstGuess]) -> OpenArm | None:
+def arm_ambiguity(guesses: Sequence[FirstGuess]) -> ArmAmbiguity | None:
     """Return the ambiguity of the least ambiguous recording. Return None if it is negligible."""
     found = [each.registration for each in guesses if each.registration is not None]
-    least = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
-    if least is None or np.trace(least.left_open[3:6, 3:6]) < OPEN_M**2:
+    best = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
+    if best is None or np.trace(best.left_open[3:6, 3:6]) < OPEN_M**2:
         return None
-    late = float(np.sqrt(np.trace(least.left_open) / (least.open_by @ least.open_by)))
-    return OpenArm(dict(zip(ARM_PARAMETERS, least.open_by[3:6].tolist(), strict=True)), late)
+    delay_std_s = float(np.sqrt(np.trace(best.left_open) / (best.open_by @ best.open_by)))
+    return ArmAmbiguity(dict(zip(ARM_PARAMETERS, best.open_by[3:6].tolist(), strict=True)), delay_std_s)
 
 
-def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
+def arm_change(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
     """Return the largest change (m), by arm parameter, among rivals that explain the data equally well.
 
     rivals: hypotheses with another clock.
@@ -180,7 +180,7 @@ def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
     return max(moved, key=lambda each: sum(by**2 for by in each.values()), default={})
 
 
-def moved_lag(fit: Fit, joint: Fit) -> dict[str, float]:
+def lag_change(fit: Fit, joint: Fit) -> dict[str, float]:
     """Return the change (s) of a lag from a joint fit with more clocks, if both are equally likely."""
     if not {LAG} <= fit.values.keys() & joint.values.keys():
         return {}
@@ -189,40 +189,40 @@ def moved_lag(fit: Fit, joint: Fit) -> dict[str, float]:
     return {name: value - joint.values[LAG][0][name] for name, value in fit.values[LAG][0].items()}
 
 
-def with_moved(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
-    """Return a covariance (6 + p, 6 + p) that includes changes from `moved_arm` and `moved_lag`."""
+def with_changes(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
+    """Return a covariance (6 + p, 6 + p) that includes changes from `arm_change` and `lag_change`."""
     step = np.zeros(len(covariance))
-    for name, i in (_places(fit, ARM) | _places(fit, LAG)).items():
+    for name, i in (_indices(fit, ARM) | _indices(fit, LAG)).items():
         step[i] = moved.get(name, 0.0)
     return np.asarray(covariance + np.outer(step, step))
 
 
-def with_open(fit: Fit, covariance: Array, opened: OpenArm | None) -> Array:
+def with_ambiguity(fit: Fit, covariance: Array, trade_off: ArmAmbiguity | None) -> Array:
     """Return a covariance (6 + p, 6 + p) that includes registration's ambiguity of arm and reference clock."""
-    if opened is None:
+    if trade_off is None:
         return covariance
     clock = [6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == REFERENCE_CLOCK]
     step = np.zeros(len(covariance))
     step[clock] = 1.0
-    for name, i in _places(fit, ARM).items():
-        step[i] = opened.by[name]
+    for name, i in _indices(fit, ARM).items():
+        step[i] = trade_off.by[name]
     known = max(np.diag(covariance)[clock].tolist(), default=0.0)
-    return np.asarray(covariance + max(opened.delay_std_s**2 - known, 0.0) * np.outer(step, step))
+    return np.asarray(covariance + max(trade_off.delay_std_s**2 - known, 0.0) * np.outer(step, step))
 
 
-def opened_combination(fit: Fit, covariance: Array, opened: OpenArm | None) -> Combination | None:
+def ambiguous_combination(fit: Fit, covariance: Array, trade_off: ArmAmbiguity | None) -> Combination | None:
     """Return the observable combination of arm and reference clock from a fit of one recording without that clock."""
-    at = _places(fit, ARM)
-    if opened is None or not at or len(fit.seen) > 1:
+    at = _indices(fit, ARM)
+    if trade_off is None or not at or len(fit.seen) > 1:
         return None
-    name = max(at, key=lambda each: abs(opened.by[each]))
+    name = max(at, key=lambda each: abs(trade_off.by[each]))
     value, std = float(fit.hypothesis.vector()[at[name]]), float(np.sqrt(covariance[at[name], at[name]]))
-    return Combination(name, REFERENCE_CLOCK, opened.by[name], around(value, std))
+    return Combination(name, REFERENCE_CLOCK, trade_off.by[name], around(value, std))
 
 
 def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
     """Return the observable combination of arm and clock of one recording from their covariance (6 + p, 6 + p)."""
-    arm, delay = _places(fit, ARM), _places(fit, clock).get("seconds")
+    arm, delay = _indices(fit, ARM), _indices(fit, clock).get("seconds")
     if delay is None or not arm or len(fit.seen) > 1:
         return None
     vector = fit.hypothesis.vector()
@@ -234,7 +234,7 @@ def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
     return Combination(name, clock, speed, around(value, std))
 
 
-def _places(fit: Fit, effect: str) -> dict[str, int]:
+def _indices(fit: Fit, effect: str) -> dict[str, int]:
     """Return the index of each parameter of an effect in a fit's vector; of the last recording."""
     parameters = enumerate(fit.hypothesis.parameters(), start=6)
     return {each.spec.name: i for i, each in parameters if each.effect.name == effect}

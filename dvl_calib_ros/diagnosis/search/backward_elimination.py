@@ -14,7 +14,7 @@ from ..fit.selection_criteria import (
     best_of,
     fit_without,
     log_p_in_place,
-    price,
+    penalty,
     robust_covariance,
     robust_p,
     times_tried,
@@ -37,7 +37,7 @@ def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+def without_chance(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """Return a fit without effects that chance or slow noise explains as well.
 
     An effect is kept if the covariance of its interval makes it significant, and it predicts held-out data beyond its
@@ -53,13 +53,13 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             continue
         spare = []
         for effect in fit.effects:
-            rest = fit_without(fitter, fit, effect)
-            chance = price(effect, n_effects, n, times_tried(effect)) - n_amplitudes(effect, n)
-            spare.append((predictive_gain_of(problem, rest, fit) - chance, rest))
-        worst, rest = min(spare, key=lambda each: each[0])
+            reduced = fit_without(fitter, fit, effect)
+            chance = penalty(effect, n_effects, n, times_tried(effect)) - n_amplitudes(effect, n)
+            spare.append((predictive_gain_of(problem, reduced, fit) - chance, reduced))
+        worst, reduced = min(spare, key=lambda each: each[0])
         if worst > 0.0:
             return fit
-        fit = rest
+        fit = reduced
     return fit
 
 
@@ -70,63 +70,63 @@ def repeated_effects(
 
     every: effects with their second occurrence. Recordings share the times of an effect, so several have no proposals.
     """
-    found: list[Fit] = []
+    refitted: list[Fit] = []
     if len(fitter.problem.recordings) > 1:
-        return found
-    for name, whole in every.items():
-        own = [fit for fit in fits if whole.again and name in fit.values]
-        if not own:
+        return refitted
+    for name, double in every.items():
+        candidates = [fit for fit in fits if double.again and name in fit.values]
+        if not candidates:
             continue
-        best = best_of(own, effects)
-        if whole.again.keys() <= best.values[name][0].keys():
-            starts = either_alone(best, effects[name], whole)
+        best = best_of(candidates, effects)
+        if double.again.keys() <= best.values[name][0].keys():
+            starts = single_occurrences(best, effects[name], double)
         else:
             n = len(best.seen)
-            once, twice = (price(each, len(effects), n, times_tried(each)) for each in (effects[name], whole))
+            once, twice = (penalty(each, len(effects), n, times_tried(each)) for each in (effects[name], double))
             limit = best.deviance + once - twice
-            starts = _a_second_time(fitter, best, whole, limit)
-        found += [fitter.fit(start, best.noise) for start in starts]
-    return found
+            starts = _second_occurrences(fitter, best, double, limit)
+        refitted += [fitter.fit(start, best.noise) for start in starts]
+    return refitted
 
 
-def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
+def _second_occurrences(fitter: Fitter, fit: Fit, double: Effect, limit: float) -> list[Hypothesis]:
     """Return the best starts below a deviance `limit` with a second occurrence, both in order of time."""
-    others = [effect for effect in fit.effects if effect.name != whole.name]
-    (again,) = (spec.name for spec in whole.parameters if spec.name in whole.again and is_time_of_run(spec))
+    kept_effects = [effect for effect in fit.effects if effect.name != double.name]
+    (again,) = (spec.name for spec in double.parameters if spec.name in double.again and is_time_of_run(spec))
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
-    left = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
+    gain = fit.deviance - fitter.one_step(fit, fit.hypothesis)[0]
     tried = []
     times = np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist()
-    if whole.name == LEAP:
-        times += [at for at, _ in gaps(fitter, fit)]
-    for at in times:
-        values = tuple({**whole.defaults, **each, again: at} for each in fit.values[whole.name])
-        start = fit.hypothesis.with_effects([*others, whole], len(values), {whole.name: values})
-        misfit, start = fitter.straight_on(fit, start)
-        if misfit + left > limit:
+    if double.name == LEAP:
+        times += [time for time, _ in gaps(fitter, fit)]
+    for time in times:
+        values = tuple({**double.defaults, **each, again: time} for each in fit.values[double.name])
+        start = fit.hypothesis.with_effects([*kept_effects, double], len(values), {double.name: values})
+        misfit, start = fitter.one_step(fit, start)
+        if misfit + gain > limit:
             continue
-        if at < values[0][whole.again[again]]:
-            names = {**whole.again, **{first: second for second, first in whole.again.items()}}
-            values = tuple({names[key]: value for key, value in each.items()} for each in start.values[whole.name])
-            start = start.with_effects(start.effects, len(values), {whole.name: values})
+        if time < values[0][double.again[again]]:
+            names = {**double.again, **{first: second for second, first in double.again.items()}}
+            values = tuple({names[key]: value for key, value in each.items()} for each in start.values[double.name])
+            start = start.with_effects(start.effects, len(values), {double.name: values})
         tried.append((misfit, start))
     return [start for _, start in sorted(tried, key=lambda each: each[0])[:KEPT_VARIANTS]]
 
 
-def either_alone(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
+def single_occurrences(fit: Fit, single: Effect, double: Effect) -> list[Hypothesis]:
     """Return starts with the first or the second occurrence alone, if the other is near zero in σ."""
     std = np.sqrt(np.diag(fit.system.covariance()))
     clear = {
         each.spec.name
-        for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
-        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > SETTINGS.outlying * own
+        for each, sigma in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
+        if each.effect.name == double.name and abs(fit.hypothesis.value(each)) > SETTINGS.outlying * sigma
     }
-    clear = {name for name in clear if not any(is_time_of_run(s) for s in whole.parameters if s.name == name)}
-    others = [effect for effect in fit.effects if effect.name != whole.name]
-    back = {first: second for second, first in whole.again.items()}
+    clear = {name for name in clear if not any(is_time_of_run(s) for s in double.parameters if s.name == name)}
+    kept_effects = [effect for effect in fit.effects if effect.name != double.name]
+    back = {first: second for second, first in double.again.items()}
     starts = []
-    for kept, out in (({first: first for first in back}, set(whole.again)), (back, set(back))):
+    for kept, out in (({first: first for first in back}, set(double.again)), (back, set(back))):
         if not out & clear:
-            values = tuple({first: each[name] for first, name in kept.items()} for each in fit.values[whole.name])
-            starts.append(fit.hypothesis.with_effects([*others, once], len(values), {whole.name: values}))
+            values = tuple({first: each[name] for first, name in kept.items()} for each in fit.values[double.name])
+            starts.append(fit.hypothesis.with_effects([*kept_effects, single], len(values), {double.name: values}))
     return starts

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...effects.base import Effect
 from ..fit.gauss_newton import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
-from ..fit.selection_criteria import price, step_of_times, windows
+from ..fit.selection_criteria import penalty, step_of_times, windows
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
 from ..model.settings import SETTINGS
@@ -50,7 +50,7 @@ class Variant:
         return self.columns.shape[2]
 
     @property
-    def comes_and_goes(self) -> bool:
+    def is_intermittent(self) -> bool:
         """Return whether the effect acts during a part of the run only."""
         times = [spec.name for spec in self.effect.parameters if is_time_of_run(spec)]
         return any(each[name] != self.effect.defaults[name] for each in self.values for name in times)
@@ -92,11 +92,11 @@ def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
     fit = replace(fit, noise=fit.noise.white)
     table, to_fit = _combinations(fitter, fit, effects)
     own = len(fit.effects)
-    most = MOST_OF_NOISE * table.misfit(range(own))
+    limit = MOST_OF_NOISE * table.misfit(range(own))
     come = [
         chosen
         for chosen in to_fit
-        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.misfit(chosen) < most
+        if any(i >= own and table.variants[i].is_intermittent for i in chosen) and table.misfit(chosen) < limit
     ]
     return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
 
@@ -107,7 +107,7 @@ def _combinations(
     """Return the linearised model about a fit, and its combinations of effects to fit, best first."""
     table = linearised(fitter, fit, effects)
     n = len(fitter.problem.recordings)
-    cost = [price(v.effect, len(effects), n, v.tried) for v in table.variants]
+    cost = [penalty(v.effect, len(effects), n, v.tried) for v in table.variants]
     own = list(range(len(fit.effects)))
     usable = _shortlisted(table, own, cost)
     scored: list[tuple[float, tuple[int, ...]]] = []
@@ -182,13 +182,13 @@ def _gram(problem: Problem, noise: Noise, columns: Array, target: Array) -> Arra
     recording's own parameters have zero columns in others."""
     total = np.zeros((columns.shape[2] + 1,) * 2)
     for rows in problem.rows_of:
-        own, of_it = columns[rows], noise.part(rows)
-        has = np.asarray(own.any(axis=(0, 1)))
-        if not has.any():
-            has[:] = True
-        white = of_it.whiten(own if has.all() else own[:, :, has])
-        here, none = np.flatnonzero(np.append(has, True)), np.zeros(white.shape[1])
-        total[np.ix_(here, here)] += WhitenedLeastSquares.of(white, of_it.whiten(target[rows]), none, none).gram
+        part, noise_of = columns[rows], noise.part(rows)
+        nonzero = np.asarray(part.any(axis=(0, 1)))
+        if not nonzero.any():
+            nonzero[:] = True
+        white = noise_of.whiten(part if nonzero.all() else part[:, :, nonzero])
+        at, zeros = np.flatnonzero(np.append(nonzero, True)), np.zeros(white.shape[1])
+        total[np.ix_(at, at)] += WhitenedLeastSquares.of(white, noise_of.whiten(target[rows]), zeros, zeros).gram
     return total
 
 
@@ -197,52 +197,52 @@ def _std(effect: Effect, p: int, n_recordings: int) -> Array:
     return np.array(sizes * (p // len(sizes)))
 
 
-def _shortlisted(table: LinearisedModel, own: Sequence[int], cost: Sequence[float]) -> list[int]:
+def _shortlisted(table: LinearisedModel, present: Sequence[int], cost: Sequence[float]) -> list[int]:
     """Return all variants of the fit and the most promising others, alone or in addition."""
-    alone, none = table.misfit(own), table.misfit([])
+    misfit, empty_misfit = table.misfit(present), table.misfit([])
     gains: dict[int, float] = {}
     adds: dict[int, float] = {}
     for index in range(len(table.variants)):
-        if index in own:
+        if index in present:
             continue
-        by_itself = none - table.misfit([index]) - cost[index]
-        adds[index] = alone - table.misfit([*own, index]) - cost[index]
+        by_itself = empty_misfit - table.misfit([index]) - cost[index]
+        adds[index] = misfit - table.misfit([*present, index]) - cost[index]
         instead = max(
             (table.misfit(rest) - table.misfit([*rest, index]) - cost[index]
-             for rest in ([i for i in own if i != out] for out in own)),
+             for rest in ([i for i in present if i != out] for out in present)),
             default=-np.inf,
         )  # fmt: skip
         # strong effects resemble whatever explains much by itself: the gain in addition counts more
         gains[index] = max(adds[index], 0.1 * instead, 0.01 * by_itself)
     kept: list[int] = []
     of_effect: dict[str, int] = {}
-    most = sorted((i for i in adds if adds[i] > 0.0), key=lambda i: -adds[i])
-    for places, ranked in ((ADDING_MOST, most), (SHORTLIST, sorted(gains, key=lambda i: -gains[i]))):
+    by_addition = sorted((i for i in adds if adds[i] > 0.0), key=lambda i: -adds[i])
+    for limit, ranked in ((ADDING_MOST, by_addition), (SHORTLIST, sorted(gains, key=lambda i: -gains[i]))):
         for index in ranked:
             name = table.variants[index].effect.name
-            if index not in kept and of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < places:
+            if index not in kept and of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < limit:
                 kept.append(index)
                 of_effect[name] = of_effect.get(name, 0) + 1
-    return [*own, *kept]
+    return [*present, *kept]
 
 
 def combined(fitter: Fitter, fit: Fit, table: LinearisedModel, chosen: Sequence[int]) -> Hypothesis:
     """Return the hypothesis of a combination. The fit's effects start at its values, others at the linear solution."""
-    part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
-    solution = part.solution()[6:]
+    system = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
+    solution = system.solution()[6:]
     n = len(fitter.problem.recordings)
     start: dict[str, tuple[Values, ...]] = {}
-    at = 0
+    offset = 0
     for index in chosen:
         variant = table.variants[index]
-        step = solution[at : at + variant.p]
-        at += variant.p
+        step = solution[offset : offset + variant.p]
+        offset += variant.p
         if variant.effect in fit.effects:
             start[variant.effect.name] = variant.values
             continue
         empty = no_effect().with_effects([variant.effect], n, {variant.effect.name: variant.values})
-        moved = empty.moved(np.concatenate([np.zeros(6), step]))
-        start[variant.effect.name] = moved.values[variant.effect.name]
+        solved = empty.moved(np.concatenate([np.zeros(6), step]))
+        start[variant.effect.name] = solved.values[variant.effect.name]
     effects = [table.variants[index].effect for index in chosen]
     return fit.hypothesis.with_effects(effects, n, start)
 
@@ -271,55 +271,55 @@ def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> 
     A clock jump at the beginning is a constant DVL delay.
     """
     n, values = len(fit.seen), fit.values
-    said = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
-    if not set(said) & set(values):
+    clocks = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
+    if not set(clocks) & set(values):
         return []
     dvl, reference, attitude = (
         np.array([each["seconds"] for each in values[name]]) if name in values else np.zeros(n) for name in CLOCKS
     )
     dvl, reference = dvl - attitude, reference - attitude
-    if LEAP in said:
+    if LEAP in clocks:
         dvl = dvl + [each["seconds"] for each in values[LEAP]]
-    rest = [effect for effect in fit.effects if effect.name not in said]
-    told = [
+    kept = [effect for effect in fit.effects if effect.name not in clocks]
+    alternatives = [
         {ATTITUDE_CLOCK: -0.5 * (dvl + reference)}, {DVL_CLOCK: dvl - reference}, {REFERENCE_CLOCK: reference - dvl},
         {DVL_CLOCK: dvl, REFERENCE_CLOCK: reference},
     ]  # fmt: skip
     found = []
-    for one in told:
-        if set(one) <= set(effects) and len(rest) + len(one) <= SETTINGS.max_effects:
-            start: dict[str, tuple[Values, ...]] = _at_other_times(fit, rest, dvl + attitude - one.get(DVL_CLOCK, 0.0))
+    for one in alternatives:
+        if set(one) <= set(effects) and len(kept) + len(one) <= SETTINGS.max_effects:
+            start: dict[str, tuple[Values, ...]] = _at_other_times(fit, kept, dvl + attitude - one.get(DVL_CLOCK, 0.0))
             start |= {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
-            found.append(fit.hypothesis.with_effects([*rest, *(effects[name] for name in one)], n, start))
+            found.append(fit.hypothesis.with_effects([*kept, *(effects[name] for name in one)], n, start))
     return found
 
 
-def _at_other_times(fit: Fit, effects: Sequence[Effect], later: Array) -> dict[str, tuple[Values, ...]]:
+def _at_other_times(fit: Fit, effects: Sequence[Effect], shift: Array) -> dict[str, tuple[Values, ...]]:
     """Return the values of intermittent effects, delayed by some seconds per recording."""
-    found: dict[str, tuple[Values, ...]] = {}
+    shifted: dict[str, tuple[Values, ...]] = {}
     for effect in effects:
         times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
-        per = zip(fit.values[effect.name], later.tolist(), strict=True)
+        pairs = zip(fit.values[effect.name], shift.tolist(), strict=True)
         if times:  # an effect from the beginning keeps its start
-            found[effect.name] = tuple(
-                {**each, **{name: max(each[name] + by, 0.0) if each[name] else 0.0 for name in times}}
-                for each, by in per
+            shifted[effect.name] = tuple(
+                {**each, **{name: max(each[name] + seconds, 0.0) if each[name] else 0.0 for name in times}}
+                for each, seconds in pairs
             )
-    return found
+    return shifted
 
 
 def _with_lag_or_delay(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """Return the fit with a lag of the reference for its delay, or a delay for its lag."""
-    rest = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
+    others = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
     return [
-        fit.hypothesis.with_effects([*rest, *(effects[name] for name in start)], len(fit.seen), start)
+        fit.hypothesis.with_effects([*others, *(effects[name] for name in start)], len(fit.seen), start)
         for start in lags_and_delays(fit, effects)
     ]
 
 
 def jumps_at_start(fitter: Fitter, fit: Fit) -> bool:
     """Return whether the fit has one clock jump only, before the first time that is tried."""
-    leaps = fit.values.get(LEAP, ())
+    jumps = fit.values.get(LEAP, ())
     first = step_of_times(fitter.problem)
-    twice = any(np.isfinite(leap.get("again_at_s", np.inf)) for leap in leaps)
-    return bool(leaps) and not twice and all(leap["at_s"] < first for leap in leaps)
+    twice = any(np.isfinite(jump.get("again_at_s", np.inf)) for jump in jumps)
+    return bool(jumps) and not twice and all(jump["at_s"] < first for jump in jumps)

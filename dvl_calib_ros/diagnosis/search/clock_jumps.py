@@ -45,27 +45,27 @@ class Delays:
 
 
 def hypotheses_with_jumps(
-    fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]
+    fitter: Fitter, fit: Fit, single: Mapping[str, Effect], every: Mapping[str, Effect]
 ) -> list[Hypothesis]:
     """Return hypotheses with clock jumps at the delay changes of one recording, replacing effects that resemble jumps.
 
     once, every: effects with one and with two jumps. Empty if the fit has no effect of time.
     """
     present = {effect.name for effect in fit.effects}
-    if len(fit.seen) > 1 or LEAP not in once or not present & {*OF_TIME}:
+    if len(fit.seen) > 1 or LEAP not in single or not present & {*OF_TIME}:
         return []
-    rest = [effect for effect in fit.effects if effect.name not in STANDS_IN]
-    squares, ends = _squares(fitter, fit, rest, every[DVL_CLOCK])
-    found = _found(squares)
-    if not found.begins:
+    kept = [effect for effect in fit.effects if effect.name not in STANDS_IN]
+    squares, ends = _squares(fitter, fit, kept, every[DVL_CLOCK])
+    delays = _best_delays(squares)
+    if not delays.begins:
         return []
-    times = [_time(fitter, ends, part, by) for part, by in zip(found.begins, found.seconds[1:], strict=True)]
-    steps = np.diff(found.seconds).tolist()
+    times = [_time(fitter, ends, part, delay) for part, delay in zip(delays.begins, delays.seconds[1:], strict=True)]
+    steps = np.diff(delays.seconds).tolist()
     values = {"seconds": steps[0], "at_s": times[0]}
     if len(steps) > 1:
         values |= {"again_seconds": steps[1], "again_at_s": max(times[1], times[0])}
-    leap = every[LEAP] if len(steps) > 1 else once[LEAP]
-    return _hypotheses(fit, rest, once, leap, values, found.seconds[0])
+    jump = every[LEAP] if len(steps) > 1 else single[LEAP]
+    return _hypotheses(fit, kept, single, jump, values, delays.seconds[0])
 
 
 def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
@@ -79,34 +79,34 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     (recording,) = fitter.problem.recordings
     stamps = recording.dvl.time
     steps = np.diff(stamps)
-    usual = float(np.median(steps))
-    back = [(event.before, -event.by) for event in recording.set_back]
-    for event in recording.set_back:
-        steps[(stamps[:-1] <= event.before) & (stamps[1:] >= event.after)] = usual
+    interval = float(np.median(steps))
+    back = [(event.before, -event.by) for event in recording.backward_steps]
+    for event in recording.backward_steps:
+        steps[(stamps[:-1] <= event.before) & (stamps[1:] >= event.after)] = interval
     largest = np.argsort(-steps)[:GAPS]
-    ahead = zip(stamps[largest].tolist(), (steps[largest] - usual).tolist(), strict=True)
+    ahead = zip(stamps[largest].tolist(), (steps[largest] - interval).tolist(), strict=True)
     injections = [each for each in fit.hypothesis.injections(0) if each.effect.name != LEAP]
-    leaps: list[tuple[float, float]] = []  # stamps (s) of the jumps, and sizes (s)
+    jumps: list[tuple[float, float]] = []  # stamps (s) of the jumps, and sizes (s)
     for each in fit.values.get(LEAP, ()):
         for at_s, seconds in (("at_s", "seconds"), ("again_at_s", "again_seconds")):
             if np.isfinite(each.get(at_s, np.inf)):
-                own = late(injections, ActsOn.DVL_CLOCK, np.array([each[at_s]]))[0]
-                leaps.append((each[at_s] + float(own) + sum(by for _, by in leaps), each[seconds]))
-    found = []
+                delay = late(injections, ActsOn.DVL_CLOCK, np.array([each[at_s]]))[0]
+                jumps.append((each[at_s] + float(delay) + sum(by for _, by in jumps), each[seconds]))
+    result = []
     for stamp, gap in (*back, *ahead):
-        alike = [each for each in leaps if _is_as_large(each[1], gap)]
-        its = min(alike, key=lambda each: abs(each[0] - stamp), default=None)  # the jump that may have left the gap
-        others = [each for each in leaps if each != its]
-        before = sum(by for at, by in others if at < stamp)
-        at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * usual
+        matching = [each for each in jumps if _is_as_large(each[1], gap)]
+        its = min(matching, key=lambda each: abs(each[0] - stamp), default=None)  # the jump that may have left the gap
+        other_jumps = [each for each in jumps if each != its]
+        before = sum(by for at, by in other_jumps if at < stamp)
+        at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * interval
         if abs(gap) > GAP_FROM_S and at > 0.0:
-            found.append((at, gap))
-    return found
+            result.append((at, gap))
+    return result
 
 
-def _is_shifted(gap: float, usual: float) -> bool:
+def _is_shifted(gap: float, interval: float) -> bool:
     """Return whether a gap is a clock jump: negative or not a whole number of steps, unlike lost samples."""
-    return gap < 0.0 or OF_A_STEP < (gap / usual) % 1.0 < 1.0 - OF_A_STEP
+    return gap < 0.0 or OF_A_STEP < (gap / interval) % 1.0 < 1.0 - OF_A_STEP
 
 
 def _is_as_large(by: float, gap: float) -> bool:
@@ -122,20 +122,20 @@ def with_jumps_in_gaps(fitter: Fitter, fit: Fit) -> Fit:
     for at_s, seconds in (("at_s", "seconds"), ("again_at_s", "again_seconds")):
         if not all(at_s in each for each in fit.values.get(LEAP, ({},))):
             continue
-        for at, gap in gaps(fitter, fit):
+        for time, gap in gaps(fitter, fit):
             (values,) = fit.values[LEAP]
-            other = values.get("at_s" if at_s == "again_at_s" else "again_at_s", np.inf)
-            is_of_other = abs(other - at) < step_of_times(fitter.problem)
+            other_time = values.get("at_s" if at_s == "again_at_s" else "again_at_s", np.inf)
+            is_of_other = abs(other_time - time) < step_of_times(fitter.problem)
             if is_of_other or not _is_as_large(values[seconds], gap):
                 continue
-            tried = replace(fit.hypothesis, values={**fit.values, LEAP: ({**values, at_s: at},)})
+            trial = replace(fit.hypothesis, values={**fit.values, LEAP: ({**values, at_s: time},)})
             times = fitter.problem.time
-            near = (times > min(at, values[at_s]) - abs(gap)) & (times < max(at, values[at_s]) + abs(gap))
-            fair = replace(fitter, outliers=np.where(near[:, None], 0.0, fitter.outliers), _fits={})
-            left = [fair.fit(each, fit.noise) for each in (fit.hypothesis, tried)]
-            before, after = (float((each.noise.whiten(each.residual) ** 2).sum()) for each in left)
+            excluded = (times > min(time, values[at_s]) - abs(gap)) & (times < max(time, values[at_s]) + abs(gap))
+            fair = replace(fitter, outliers=np.where(excluded[:, None], 0.0, fitter.outliers), _fits={})
+            refitted = [fair.fit(each, fit.noise) for each in (fit.hypothesis, trial)]
+            before, after = (float((each.noise.whiten(each.residual) ** 2).sum()) for each in refitted)
             if after < before + OF_A_TIME:
-                fit = fitter.fit(left[1].hypothesis, fit.noise)
+                fit = fitter.fit(refitted[1].hypothesis, fit.noise)
     return fit
 
 
@@ -145,77 +145,77 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
     at_s: name of the time parameter. Evidence is a backward step, or a gap of matching size that is no whole number of
     steps.
     """
-    usual = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
-    value, by = fit.values[LEAP][0][at_s], fit.values[LEAP][0][at_s.replace("at_s", "seconds")]
-    for at, gap in gaps(fitter, fit):
-        if _is_shifted(gap, usual) and _is_as_large(by, gap) and abs(value - at) < max(usual, AS_LARGE_S):
-            return value, min(value, at) - usual, max(value, at) + usual
+    interval = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
+    value, size = fit.values[LEAP][0][at_s], fit.values[LEAP][0][at_s.replace("at_s", "seconds")]
+    for time, gap in gaps(fitter, fit):
+        if _is_shifted(gap, interval) and _is_as_large(size, gap) and abs(value - time) < max(interval, AS_LARGE_S):
+            return value, min(value, time) - interval, max(value, time) + interval
     return None
 
 
 def _hypotheses(
-    fit: Fit, rest: Sequence[Effect], once: Mapping[str, Effect], leap: Effect, values: Values, before: float
+    fit: Fit, kept: Sequence[Effect], single: Mapping[str, Effect], jump: Effect, values: Values, before: float
 ) -> list[Hypothesis]:
     """Return hypotheses with a jump, with and without a delay before it, next to all or only the usual effects."""
-    usual = [effect for effect in rest if effect.name in (*OF_TIME, ARM)]
-    if ARM in once and ARM not in {effect.name for effect in usual}:
-        usual.append(once[ARM])
-    made: dict[frozenset[str], Hypothesis] = {}
-    clocks = [{}, {DVL_CLOCK: before}] if abs(before) > GAP_FROM_S and DVL_CLOCK in once else [{}]
-    lags = [{}, *lags_and_delays(fit, once)]
-    for others, lag, clock in itertools.product((list(rest), usual), lags, clocks):
+    essential = [effect for effect in kept if effect.name in (*OF_TIME, ARM)]
+    if ARM in single and ARM not in {effect.name for effect in essential}:
+        essential.append(single[ARM])
+    hypotheses: dict[frozenset[str], Hypothesis] = {}
+    clocks = [{}, {DVL_CLOCK: before}] if abs(before) > GAP_FROM_S and DVL_CLOCK in single else [{}]
+    lags = [{}, *lags_and_delays(fit, single)]
+    for included, lag, clock in itertools.product((list(kept), essential), lags, clocks):
         if lag:
-            others = [effect for effect in others if effect.name not in LAG_OR_DELAY]
-        effects = [*others, *(once[name] for name in (*lag, *clock)), leap]
-        start: dict[str, tuple[Values, ...]] = {**lag, leap.name: (values,)}
+            included = [effect for effect in included if effect.name not in LAG_OR_DELAY]
+        effects = [*included, *(single[name] for name in (*lag, *clock)), jump]
+        start: dict[str, tuple[Values, ...]] = {**lag, jump.name: (values,)}
         start |= {name: ({"seconds": seconds},) for name, seconds in clock.items()}
         if len(effects) <= SETTINGS.max_effects:
             names = frozenset(effect.name for effect in effects)
-            made.setdefault(names, fit.hypothesis.with_effects(effects, 1, start))
-    return list(made.values())
+            hypotheses.setdefault(names, fit.hypothesis.with_effects(effects, 1, start))
+    return list(hypotheses.values())
 
 
-def _squares(fitter: Fitter, fit: Fit, rest: Sequence[Effect], clock: Effect) -> tuple[Array, Array]:
+def _squares(fitter: Fitter, fit: Fit, kept: Sequence[Effect], clock: Effect) -> tuple[Array, Array]:
     """Return whitened squares (D, P) per delay and part of the run, and the last bins (P,) of the parts."""
     white = fit.noise.white
     ends = np.linspace(0, len(fit.residual), PARTS + 1).astype(int)
     squares = np.zeros((len(DELAYS), PARTS))
     for number, seconds in enumerate(DELAYS.tolist()):
-        tried = fit.hypothesis.with_effects([*rest, clock], 1, {clock.name: ({"seconds": seconds},)})
-        each = white.whiten(fitter.evaluated(tried)[1]).reshape(len(fit.residual), -1)
-        squares[number] = np.add.reduceat((each**2).sum(axis=1), ends[:-1])
+        trial = fit.hypothesis.with_effects([*kept, clock], 1, {clock.name: ({"seconds": seconds},)})
+        whitened = white.whiten(fitter.evaluated(trial)[1]).reshape(len(fit.residual), -1)
+        squares[number] = np.add.reduceat((whitened**2).sum(axis=1), ends[:-1])
     return squares, ends[1:]
 
 
-def _found(squares: Array) -> Delays:
+def _best_delays(squares: Array) -> Delays:
     """Return the delays with no, one or two jumps; each jump must reduce the squares enough."""
-    until = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
+    cumulative = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
     n = squares.shape[1]
 
-    def best(a: int, b: int) -> tuple[float, int]:
-        left = until[:, b] - until[:, a]
-        return float(left.min()), int(left.argmin())
+    def best_delay(a: int, b: int) -> tuple[float, int]:
+        gains = cumulative[:, b] - cumulative[:, a]
+        return float(gains.min()), int(gains.argmin())
 
-    none = best(0, n)
-    places = range(FEWEST_PARTS, n - FEWEST_PARTS + 1)
-    one = min((best(0, m)[0] + best(m, n)[0], m) for m in places)
-    two = min(
-        (best(0, m)[0] + best(m, k)[0] + best(k, n)[0], m, k)
-        for m, k in itertools.combinations(places, 2)
+    no_jump = best_delay(0, n)
+    starts = range(FEWEST_PARTS, n - FEWEST_PARTS + 1)
+    one_jump = min((best_delay(0, m)[0] + best_delay(m, n)[0], m) for m in starts)
+    two_jumps = min(
+        (best_delay(0, m)[0] + best_delay(m, k)[0] + best_delay(k, n)[0], m, k)
+        for m, k in itertools.combinations(starts, 2)
         if k - m >= FEWEST_PARTS
     )
     edges = [0, n]
-    if one[0] - two[0] > SETTINGS.conclusive and none[0] - two[0] > 2.0 * SETTINGS.conclusive:
-        edges = [0, two[1], two[2], n]
-    elif none[0] - one[0] > SETTINGS.conclusive:
-        edges = [0, one[1], n]
-    delays = tuple(float(DELAYS[best(a, b)[1]]) for a, b in itertools.pairwise(edges))
+    if one_jump[0] - two_jumps[0] > SETTINGS.conclusive and no_jump[0] - two_jumps[0] > 2.0 * SETTINGS.conclusive:
+        edges = [0, two_jumps[1], two_jumps[2], n]
+    elif no_jump[0] - one_jump[0] > SETTINGS.conclusive:
+        edges = [0, one_jump[1], n]
+    delays = tuple(float(DELAYS[best_delay(a, b)[1]]) for a, b in itertools.pairwise(edges))
     return Delays(delays, tuple(edges[1:-1]))
 
 
-def _time(fitter: Fitter, ends: Array, part: int, by: float) -> float:
-    """Return the true time, s of the run, at which a part with a DVL delay `by` (s) begins."""
+def _time(fitter: Fitter, ends: Array, part: int, delay: float) -> float:
+    """Return the true time, s of the run, at which a part with a DVL delay `delay` (s) begins."""
     problem = fitter.problem
     (grid,) = problem.grids
-    at = float(problem.time[min(int(ends[part - 1]), len(problem.time) - 1)])
-    return max(0.0, at + grid.delay_s - by) if grid.clock is ActsOn.DVL_CLOCK else max(0.0, at)
+    time = float(problem.time[min(int(ends[part - 1]), len(problem.time) - 1)])
+    return max(0.0, time + grid.delay_s - delay) if grid.clock is ActsOn.DVL_CLOCK else max(0.0, time)

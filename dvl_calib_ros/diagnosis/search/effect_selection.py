@@ -33,14 +33,14 @@ from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
 from ..model.recorded_streams import RecordedStreams
 from ..model.settings import SETTINGS
 from ..model.stream_curve import FAST_ENOUGH_S
-from ..noise.noise_level import estimated
+from ..noise.noise_level import estimate_noise
 from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
-from .arm_clock_ambiguity import ARM, OpenArm, guessed_arm
+from .arm_clock_ambiguity import ARM, ArmAmbiguity, guessed_arm
 from .backward_elimination import (
     eliminate,
-    only_predictive,
     repeated_effects,
+    without_chance,
 )
 from .candidates import intermittent_effects, proposed, variants_about
 from .clock_jumps import hypotheses_with_jumps, with_jumps_in_gaps
@@ -59,9 +59,9 @@ ROBUST_ROUNDS = 3
 class EffectSelection:
     """Selected effects, strongest first, with the fits without (`base`) and with them under the same noise.
 
-    testable: effects with their observable parameters. opened: trade-off of lever arm and clock at one speed. moved: by
-    arm parameter, the difference (m) to a fit with another clock that explains the data equally well. wider: the
-    hypothesis with effects that slow noise explains as well, which may nevertheless be there.
+    testable: effects with their observable parameters. trade_off: ambiguity of lever arm and clock at one speed.
+    changes: by arm parameter, the difference (m) to a fit with another clock that explains the data equally well.
+    wider: the hypothesis with effects that slow noise explains equally well.
     """
 
     selected: tuple[Selected, ...]
@@ -70,8 +70,8 @@ class EffectSelection:
     fitter: Fitter
     guesses: tuple[FirstGuess, ...]
     testable: Mapping[str, Effect]
-    opened: OpenArm | None = None
-    moved: Mapping[str, float] = field(default_factory=dict)
+    trade_off: ArmAmbiguity | None = None
+    changes: Mapping[str, float] = field(default_factory=dict)
     wider: Hypothesis | None = None
 
     def without(self, names: Collection[str]) -> EffectSelection:
@@ -101,14 +101,14 @@ def started(
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
     _check_size(problem)
     every, effects = effects, observable_parts({name: effect.once for name, effect in effects.items()}, problem)
-    problem = replace(problem, unshown=unobservable_parts(every, effects))
+    problem = replace(problem, unobservable=unobservable_parts(every, effects))
     found: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
         "reference_time_offset": tuple({"seconds": guess.offsets.reference} for guess in guesses),
     }
     present = [effects[name] for name in START if name in effects]
-    phi = problem.shown_turns @ np.median([guess.phi for guess in guesses], axis=0)
+    phi = problem.observable_turns @ np.median([guess.phi for guess in guesses], axis=0)
     start = no_effect(phi).with_effects(present, len(guesses), found)
     return problem, start, guesses, effects
 
@@ -127,7 +127,7 @@ def select(
     kept = without_slow_outliers(problem, fit.hypothesis)
     if kept is not None:
         problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
-        problem = replace(problem, unshown=fitter.problem.unshown)
+        problem = replace(problem, unobservable=fitter.problem.unobservable)
         fitter, fit = _first_fit(problem, fit.hypothesis)
     fitter, fit = with_noise_reestimated(fitter, fit, every)
     far = fitter.bursts(fit)
@@ -154,14 +154,14 @@ def select(
             break
         seen_before.add(names)
     wider = eliminate(fitter, fit, len(effects))
-    fit = only_predictive(fitter, wider, len(effects))
+    fit = without_chance(fitter, wider, len(effects))
     fitter, fit = with_noise_reestimated(fitter, fit, every)
-    fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
-    fit, alike = heading_first(fitter, fit, heading)
-    found = identify_effects(fitter, fit, guesses, effects, alike)
+    fitter, fit, effects = _with_observable_arm(fitter, fit, every, effects)
+    fit, equivalent = heading_first(fitter, fit, heading)
+    found = identify_effects(fitter, fit, guesses, effects, equivalent)
     base = fitter.fit_kept(found.fit.hypothesis.with_effects([], len(recordings), {}), found.fit.noise)
     return EffectSelection(
-        found.selected, base, found.fit, fitter, guesses, effects, found.opened, found.moved, wider.hypothesis
+        found.selected, base, found.fit, fitter, guesses, effects, found.trade_off, found.changes, wider.hypothesis
     )
 
 
@@ -199,12 +199,12 @@ def with_noise_reestimated(fitter: Fitter, fit: Fit, effects: Mapping[str, Effec
     frames = _frames(problem)
     for _ in range(2):
         explained, std = _explained(noise, columns, raw - fitter.outliers, own)
-        left = raw - explained
+        corrected = raw - explained
         noise, robust = min(
-            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in frames),
+            (estimate_noise(problem, fit.seen, corrected, rotation, columns, std) for rotation in frames),
             key=lambda each: each[0].deviance(each[1]),
         )
-        frames, fitter = [noise.rotation], Fitter(problem, left - robust)
+        frames, fitter = [noise.rotation], Fitter(problem, corrected - robust)
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
@@ -216,10 +216,10 @@ def _columns_of_all_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effe
 
 def _with_simulated_noise(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
     """Yield the same columns (M, A, p) and residual (M, A) with simulated noise in each velocity in turn."""
-    for problem in fitter.problem.shaken:
+    for problem in fitter.problem.perturbed:
         other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
-        again = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
-        yield _columns_of_all_effects(other, again, effects), problem.residual(seen)
+        perturbed = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
+        yield _columns_of_all_effects(other, perturbed, effects), problem.residual(seen)
 
 
 def _frames(problem: Problem) -> list[Array | None]:
@@ -239,7 +239,7 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
     return np.asarray(columns @ system.solution_without(of_noise)), ridge
 
 
-def _with_what_is_shown_of_the_arm(
+def _with_observable_arm(
     fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
     """Return a fit and effects with only the observable parts of the lever arm.
@@ -272,10 +272,10 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
     """
     if heading is None or len(fit.seen) < 2:
         return []
-    found = [_with_heading_in_place(fit, BY_YAW, each) for each in _two_cycles(heading)]
+    found = [_with_heading_instead(fit, BY_YAW, each) for each in _two_cycles(heading)]
     if BY_YAW & fit.values.keys():
         return found
-    straight = [fitter.straight_on(fit, each) for each in (fit.hypothesis, *found)]
+    straight = [fitter.one_step(fit, each) for each in (fit.hypothesis, *found)]
     return [each for misfit, each in straight[1:] if misfit < straight[0][0] - SETTINGS.conclusive]
 
 
@@ -283,24 +283,24 @@ def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit
     """Replace a moving mounting by an equally good heading error. Return the fit and equivalents by effect name."""
     if heading is None or len(fit.seen) < 2:
         return fit, {}
-    alike: dict[str, str] = {}
+    equivalent: dict[str, str] = {}
     if DRIFT in fit.values:
         own = next((_names(each) for each in fit.effects if each.name == HEADING), frozenset())
         drifting = heading.without(_names(heading) - own - {OF_DRIFT})
-        found = fitter.fit_kept(_with_heading_in_place(fit, {DRIFT, HEADING}, drifting), fit.noise)
+        found = fitter.fit_kept(_with_heading_instead(fit, {DRIFT, HEADING}, drifting), fit.noise)
         if found.deviance < fit.deviance + SETTINGS.indistinguishable:
             fit = found
-            alike[HEADING] = DRIFT
+            equivalent[HEADING] = DRIFT
     if MOVED in fit.values:
         of_vehicle, of_day = (
-            fitter.fit_kept(_with_heading_in_place(fit, {MOVED, HEADING}, each), fit.noise)
+            fitter.fit_kept(_with_heading_instead(fit, {MOVED, HEADING}, each), fit.noise)
             for each in _two_cycles(heading)
         )
         if of_vehicle.deviance < fit.deviance + SETTINGS.indistinguishable:
             return of_vehicle, {HEADING: MOVED}
         if of_day.deviance < fit.deviance + SETTINGS.indistinguishable:
-            alike[MOVED] = HEADING
-    return fit, alike
+            equivalent[MOVED] = HEADING
+    return fit, equivalent
 
 
 def _two_cycles(heading: Effect) -> tuple[Effect, Effect]:
@@ -313,16 +313,16 @@ def _names(effect: Effect) -> frozenset[str]:
     return frozenset(spec.name for spec in effect.parameters)
 
 
-def _with_heading_in_place(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
+def _with_heading_instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
     """Return the hypothesis of a fit with a heading error in place of the named effects."""
     n = len(fit.seen)
     none = {name: value for name, value in heading.defaults.items() if name in _names(heading)}
     own: tuple[Values, ...] = fit.values.get(HEADING, (none,) * n)
     start = tuple({name: each.get(name, value) for name, value in none.items()} for each in own)
-    if not heading.of_the_day:
+    if not heading.per_recording:
         start = ({name: sum(each[name] for each in start) / n for name in none},) * n
-    rest = [effect for effect in fit.effects if effect.name not in names]
-    return fit.hypothesis.with_effects([*rest, heading], n, {HEADING: start})
+    others = [effect for effect in fit.effects if effect.name not in names]
+    return fit.hypothesis.with_effects([*others, heading], n, {HEADING: start})
 
 
 # Robust standard deviations from the other stream; an outlier exceeds these and `SETTINGS.outlying` from its neighbours
@@ -342,14 +342,15 @@ def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[Rec
     hypothesis: Robust fit, so that lever arm and delays do not resemble outliers.
 
     """
-    found = [_without(problem, hypothesis, index) for index in range(len(problem.recordings))]
+    found = [_without_outliers(problem, hypothesis, index) for index in range(len(problem.recordings))]
     return None if all(one is two for one, two in zip(found, problem.recordings, strict=True)) else tuple(found)
 
 
-def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedStreams:
+def _without_outliers(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedStreams:
+    """Return a recording without the outliers of its slow streams."""
     recording = problem.recordings[index]
-    dvl = _kept(problem, hypothesis, index, ActsOn.DVL_CLOCK)
-    reference = _kept(problem, hypothesis, index, ActsOn.REFERENCE_CLOCK)
+    dvl = _inliers(problem, hypothesis, index, ActsOn.DVL_CLOCK)
+    reference = _inliers(problem, hypothesis, index, ActsOn.REFERENCE_CLOCK)
     if dvl.all() and reference.all():
         return recording
     return replace(
@@ -360,7 +361,7 @@ def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedSt
     )
 
 
-def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -> NDArray[np.bool_]:
+def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -> NDArray[np.bool_]:
     """Return (N,) whether each sample of one stream is no outlier."""
     recording = problem.recordings[index]
     of_dvl = clock is ActsOn.DVL_CLOCK
@@ -380,17 +381,18 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
         return kept
 
     def in_body(values: Array) -> Array:
+        """Rotate values (N, 3) of the stream to the body frame; zero on unmeasured axes."""
         if of_dvl:
             return np.asarray(values @ hypothesis.body_from_measured(problem.rotation_dvl_from_body).T) * measured
         if recording.frame is VelocityFrame.BODY:
             return values * measured
         return np.asarray(np.einsum("nji,nj->ni", recording.rotation_enu_from_body(true), values)) * measured
 
-    usual = _scatter(in_body(curve.from_neighbours))
-    off = in_body((curve.values - others(curve.time)) / curve.loudness)
-    along = (off * error).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-300) / curve.loudness.mean(axis=1)
-    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > SETTINGS.outlying)
-    bad &= (along > ALIKE[0]) & (along < ALIKE[1])
+    scatter = _scatter(in_body(curve.from_neighbours))
+    dev = in_body((curve.values - others(curve.time)) / curve.relative_noise)
+    gain = (dev * error).sum(axis=1) / np.maximum((dev**2).sum(axis=1), 1e-300) / curve.relative_noise.mean(axis=1)
+    bad = suspicious & others.covers(curve.time) & (np.abs(dev / scatter).max(axis=1) > SETTINGS.outlying)
+    bad &= (gain > ALIKE[0]) & (gain < ALIKE[1])
     return ~bad
 
 

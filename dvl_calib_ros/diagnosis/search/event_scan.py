@@ -42,7 +42,7 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
     basis: orthonormal (m, k) of the fit's whitened columns, with its prior rows. white: (m,) whitened residual of unit
     variance, orthogonal to it.
     """
-    found, excluded, fading = [], _near_fitted_times(problem, fit), fit.noise.fading
+    found, excluded, memory_samples = [], _near_fitted_times(problem, fit), fit.noise.memory_samples
     for about, (profiles_of, error_of) in EVENTS.items():
         error = error_of(problem, fit)
         if error is None:
@@ -56,7 +56,7 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
                 acts = rows.start + np.flatnonzero(profile.any(axis=1))
                 if not len(acts):  # all within a gap
                     continue
-                part = slice(max(rows.start, acts[0] - 1), min(rows.stop, acts[-1] + 1 + fading))
+                part = slice(max(rows.start, acts[0] - 1), min(rows.stop, acts[-1] + 1 + memory_samples))
                 profile = profile[part.start - rows.start : part.stop - rows.start]
                 columns = error[part, :, None] * profile[:, None, :, None]
                 columns[excluded[part]] = 0.0

@@ -28,11 +28,11 @@ from .arm_clock_ambiguity import (
     LAG,
     REFERENCE_CLOCK,
     TWO_CLOCKS,
-    OpenArm,
+    ArmAmbiguity,
+    arm_ambiguity,
+    arm_change,
     is_open,
-    moved_arm,
-    moved_lag,
-    opened_arm,
+    lag_change,
     separable_clocks,
     with_arm,
     with_clocks,
@@ -58,45 +58,45 @@ class Selected:
 class Identifiability:
     """Selected effects, strongest first, and the fit with equally likely clocks.
 
-    opened, moved: as in `EffectSelection`.
+    opened, changes: as in `EffectSelection`.
     """
 
     selected: tuple[Selected, ...]
     fit: Fit
-    opened: OpenArm | None
-    moved: Mapping[str, float]
+    trade_off: ArmAmbiguity | None
+    changes: Mapping[str, float]
 
 
 def identify_effects(
-    fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], alike: Mapping[str, str]
+    fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], swaps: Mapping[str, str]
 ) -> Identifiability:
-    """Test each effect of a fit and its substitutes. alike: by effect name, a substitute that is equally likely."""
-    called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
+    """Test each effect of a fit and its substitutes. swaps: by effect name, a substitute that is equally likely."""
+    selection, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
-    opened = opened_arm(guesses) if ARM in fit.values else None
+    trade_off = arm_ambiguity(guesses) if ARM in fit.values else None
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened, separable_clocks(guesses))
-    selected = [_with_equivalents(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
-    rivals = [one for each in selected if opened is not None and each.effect.name in CLOCKS for one in each.rivals]
-    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), selection, trade_off, separable_clocks(guesses))
+    selected = [_with_equivalents(each, [swaps[n]]) if (n := each.effect.name) in swaps else each for each in selected]
+    rivals = [one for each in selected if trade_off is not None and each.effect.name in CLOCKS for one in each.rivals]
+    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), trade_off)
     clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)
     if freed is None:
         clocks = tuple(name for name in TWO_CLOCKS if name not in fit.values)
     if clocks:
         selected = [_with_equivalents(each, clocks) if each.effect.name == ARM else each for each in selected]
-    if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
-        opened = replace(opened, delay_std_s=IN_TIME_STD_S)  # only their combination is observable
-    if opened is not None:  # a lag differs from a delay by less than interpolation errors
+    if trade_off and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
+        trade_off = replace(trade_off, delay_std_s=IN_TIME_STD_S)  # only their combination is observable
+    if trade_off is not None:  # a lag differs from a delay by less than interpolation errors
         selected = [
             _with_equivalents(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
         ]
-    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
+    fit, changes = (fit, arm_change(fit, rivals)) if freed is None or freed is fit else (freed, lag_change(fit, freed))
     if any(each.registration is not None and each.registration.ambiguity for each in guesses):
         selected = [
             _with_equivalents(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected
         ]
-    return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
+    return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, trade_off, changes)
 
 
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
@@ -104,12 +104,12 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
 
     A substitute that fits worse is a possible cause, too, if it has fewer parameters or fewer times were tried for it.
     """
-    rest = fit_without(fitter, fit, effect)
-    log_p = log_p_in_place(fitter, fit, rest, effect)
-    drop = rest.deviance - fit.deviance
-    table = linearised(fitter, rest, effects)
+    reduced = fit_without(fitter, fit, effect)
+    log_p = log_p_in_place(fitter, fit, reduced, effect)
+    drop = reduced.deviance - fit.deviance
+    table = linearised(fitter, reduced, effects)
     n = len(fit.seen)
-    own = list(range(len(rest.effects)))
+    own = list(range(len(reduced.effects)))
     found: list[tuple[float, str, Hypothesis]] = []
     best_by_name: dict[str, int] = {}
     drops = {i: table.misfit(own) - table.misfit([*own, i]) for i in range(len(own), len(table.variants))}
@@ -119,7 +119,7 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     for name, index in best_by_name.items():
         if name == effect.name or drops[index] < SCREENED_SHARE * min(linear_drop, drop) - SCREENED_MARGIN:
             continue
-        rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
+        rival = fitter.fit_kept(combined(fitter, reduced, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
         if behind < 0.5 * drop:  # a fit much worse under one noise is so under its own
             behind = min(behind, predictive_gain_of(fitter.problem, rival, fit))
@@ -136,43 +136,43 @@ def _clock_or_arm(
     fit: Fit,
     selected: list[Selected],
     n_effects: int,
-    called_for: Sequence[Effect],
-    opened: OpenArm | None,
-    known: Collection[str] = (),
+    selection: Sequence[Effect],
+    trade_off: ArmAmbiguity | None,
+    clear: Collection[str] = (),
 ) -> list[Selected]:
     """Merge lever arm and clock into one entry if each is insignificant given the other.
 
-    called_for: selected effects; a further clock is named only if significant. opened: from `opened_arm`; a reference
-    delay within that ambiguity is insignificant. known: from `separable_clocks`; an insignificant arm is no
+    selection: selected effects; a further clock is named only if significant. trade_off: from `arm_ambiguity`; a
+    reference delay within that ambiguity is insignificant. clear: from `separable_clocks`; an insignificant arm is no
     alternative to these clocks.
     """
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
-    late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
-    is_late = opened is None or max(late, default=0.0) >= OF_INTERVAL * opened.delay_std_s
+    delays = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
+    is_late = trade_off is None or max(delays, default=0.0) >= OF_INTERVAL * trade_off.delay_std_s
 
-    def is_shown(each: Selected) -> bool:
+    def passes(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:
             return False
         return each.log_p <= threshold and robust_p(fit, each.effect, *covariance) < SETTINGS.robust_level
 
-    own = {each.effect.name: each for each in selected}
-    arm, clocks = own.get(ARM), [own[name] for name in TWO_CLOCKS if name in own]
+    by_name = {each.effect.name: each for each in selected}
+    arm, clocks = by_name.get(ARM), [by_name[name] for name in TWO_CLOCKS if name in by_name]
     if arm is None or not clocks:
         return selected
     clock = min(clocks, key=lambda each: each.log_p)
-    dropped = [each for each in clocks if each is not clock and each.effect not in called_for and not is_shown(each)]
+    dropped = [each for each in clocks if each is not clock and each.effect not in selection and not passes(each)]
     selected = [each for each in selected if each not in dropped]
-    if is_shown(arm) and is_shown(clock):
+    if passes(arm) and passes(clock):
         return selected
-    if is_shown(clock) and clock.effect.name in known and arm.log_p > threshold:
+    if passes(clock) and clock.effect.name in clear and arm.log_p > threshold:
         return [each for each in selected if each is not arm]
-    one, other = (arm, clock) if is_shown(arm) else (clock, arm)
-    rest = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
-    without = fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
+    kept, other = (arm, clock) if passes(arm) else (clock, arm)
+    remaining = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
+    without = fitter.fit_kept(fit.hypothesis.with_effects(remaining, len(fit.seen), {}), fit.noise)
     log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
-    equivalent = dict.fromkeys((other.effect.name, *one.equivalent))
-    return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
+    equivalent = dict.fromkeys((other.effect.name, *kept.equivalent))
+    return [Selected(kept.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (kept, other))]
 
 
 def _with_equivalents(selected: Selected, names: Sequence[str]) -> Selected:

@@ -59,6 +59,7 @@ def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever
 
 
 def _motion(recording: RecordedStreams) -> MotionStreams | None:
+    """Return the streams of a recording for the registration."""
     attitude, dvl, reference = recording.attitude, recording.dvl, recording.reference
     times = np.zeros(0) if attitude is None else attitude.time
     quaternions = np.zeros((0, 4)) if attitude is None else attitude.values

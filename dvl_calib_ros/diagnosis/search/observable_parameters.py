@@ -38,13 +38,14 @@ def unobservable_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect
 
 
 def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
+    """Return an effect without parameters that have little influence on the residual."""
     specs = amplitudes(effect)
-    columns = problem.columns(no_effect(), seen, effect, somewhere(effect, problem))
+    columns = problem.columns(no_effect(), seen, effect, default_values(effect, problem))
     squares = (columns**2).sum(axis=1).mean(axis=0)
     of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of recordings the most informative
     sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
-    least = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
-    out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < least}
+    threshold = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
+    out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < threshold}
     if effect.name == ARM:
         by_metre = zip(specs, np.sqrt(of_each).tolist(), strict=True)
         out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < SHOWN_FROM * USUAL_MPS}
@@ -52,8 +53,8 @@ def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> 
 
 
 def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
-    """Return the lever arm without parts below 2 σ of the model error. Return None if all are significant."""
-    known = _known_to(problem, fit)
+    """Return the lever arm effect without components below 2 σ of the model error, None if all are significant."""
+    known = _model_error(problem, fit)
     faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < OF_INTERVAL * std}
     (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)
     return arm and arm.without(faint)
@@ -61,14 +62,14 @@ def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
 
 def with_observable(problem: Problem, fit: Fit, covariance: Array) -> Array:
     """Add the model error of the lever arm to a fit's covariance (6 + p, 6 + p)."""
-    found, known = covariance.copy(), _known_to(problem, fit)
+    found, known = covariance.copy(), _model_error(problem, fit)
     for number, each in enumerate(fit.hypothesis.parameters(), start=6):
         if each.effect.name == ARM:
             found[number, number] += known.get(each.spec.name, 0.0) ** 2
     return found
 
 
-def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
+def _model_error(problem: Problem, fit: Fit) -> dict[str, float]:
     """Return the model error, m, of lever arm parameters whose typical size is unobservable."""
     if problem.measured[2] or ARM not in fit.values:
         return {}
@@ -78,11 +79,11 @@ def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
         for each, size in zip(fit.hypothesis.parameters(), sizes, strict=True)
         if each.effect.name == ARM
     ]
-    least = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
-    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < least}
+    threshold = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
+    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < threshold}
 
 
-def somewhere(effect: Effect, problem: Problem) -> list[Values]:
+def default_values(effect: Effect, problem: Problem) -> list[Values]:
     """Return default values, with events at the middle of the run if no time is given."""
     values: list[Values] = []
     for recording in problem.recordings:

@@ -18,7 +18,7 @@ from ...calibration.numerics.frames import Array
 from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
-from ..fit.cross_validation import predictive_gain, surprise_elsewhere
+from ..fit.cross_validation import held_out_deviance, predictive_gain
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..fit.selection_criteria import NuisanceFit, SlowNoiseOfFit
@@ -50,7 +50,7 @@ class Unexplained:
     """Result of the score tests. log_p: of the best entry or of all jointly, adjusted for multiple tests.
 
     about: name of the regressor, or a period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest:
-    (M, A, c), the most significant columns. price: quantile of the best test under the null at
+    (M, A, c), the most significant columns. penalty: quantile of the best test under the null at
     `SETTINGS.robust_level`.
     """
 
@@ -58,7 +58,7 @@ class Unexplained:
     about: str | float
     columns: Array
     clearest: Array
-    price: float = 0.0
+    penalty: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -73,20 +73,20 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
+def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     """Test the residual of a fit against the dictionary.
 
     The null distribution is from recordings simulated from the fit (parametric bootstrap).
     """
     problem, noise = fitter.problem, fit.noise
     score_tests, white, raw, basis = _score_tests(fitter, fit, problem, fit.seen, fit.residual)
-    nothing = raw["time"][:, :, :0]
+    no_columns = raw["time"][:, :, :0]
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
-    left = noise.whiten(fit.residual)
-    left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
-    followed = lines(problem, left.reshape(-1, problem.axes))
-    tested = len(score_tests) + len(followed)
+    whitened = noise.whiten(fit.residual)
+    whitened = whitened / np.sqrt(float(whitened @ whitened) / (whitened.size - basis.shape[1]))
+    spectral = lines(problem, whitened.reshape(-1, problem.axes))
+    tested = len(score_tests) + len(spectral)
     found_events = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
     if found_events:  # slow noise explains a step as well, unless the step predicts better
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
@@ -94,41 +94,41 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
         found_events = [
             each
             for each in found_events
-            if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
+            if _is_predictive(problem, fit, each.columns, least + _limit(tested + each.tried, each.columns.shape[2]))
         ]
-    looked_at = float(np.log(tested))
+    log_trials = float(np.log(tested))
     nominal = [
         *(each.log_p for each in found_events),
         *(test.log_p() for test in score_tests),
-        *(line.log_p for line in followed),
+        *(line.log_p for line in spectral),
     ]
-    if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
-        return Unexplained(min(min(nominal) + looked_at, 0.0), "", nothing, nothing)
+    if min(nominal) + log_trials > np.log(SETTINGS.robust_level):
+        return Unexplained(min(min(nominal) + log_trials, 0.0), "", no_columns, no_columns)
     grown = _inflation_under_null(fitter, fit, score_tests)
     tests: list[tuple[float, str | float, Array]]
     tests = [
         (test.log_p(by), test.name, raw[test.name][:, :, test.at]) for test, by in zip(score_tests, grown, strict=True)
     ]
-    tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
+    tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in spectral]
     tests += [(each.log_p, each.about, each.columns) for each in found_events]
     best = min(tests, key=_first)
-    about = _plainest(tests, best[0])
-    log_p = best[0] + looked_at
+    about = _simplest(tests, best[0])
+    log_p = best[0] + log_trials
     # the best of many lines would always explain some of the noise
-    clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
+    clear = [_along_axes(line.waves, problem.axes) for line in spectral if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     tested = next((tested + each.tried for each in found_events if each.about == best[1]), tested)
-    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _price(tested, best[2].shape[2]))
-    return found if found.found else replace(found, columns=nothing, clearest=nothing)
+    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _limit(tested, best[2].shape[2]))
+    return found if found.found else replace(found, columns=no_columns, clearest=no_columns)
 
 
-def _price(tested: int, columns: int) -> float:
+def _limit(tested: int, columns: int) -> float:
     """Return the energy that the best of `tested` tests exceeds under the null with probability
     `SETTINGS.robust_level`."""
     return float(chi2_isf(SETTINGS.robust_level / tested, columns))
 
 
-def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
+def _simplest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
     """Return the candidate with the fewest columns among those within `AS_LIKELY` of log_p."""
     likely = (each for each in tests if each[0] <= log_p + AS_LIKELY)
     return min(likely, key=lambda each: (each[2].shape[2], each[0]))
@@ -160,12 +160,12 @@ def _score_tests(
     The whitened residual is of unit variance, orthogonal to the fit's columns, and ends with the rows of the prior.
     """
     noise = fit.noise
-    own = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
-    known = NuisanceFit.of(problem, fit.hypothesis, seen, own)
-    q, white = _orthogonal_to_nuisances(known, noise.whiten(known.columns), noise.whiten(residual))
+    columns = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
+    nuisance = NuisanceFit.of(problem, fit.hypothesis, seen, columns)
+    q, white = _orthogonal_to_nuisances(nuisance, noise.whiten(nuisance.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
-    unshown = known.columns.shape[2] - own.shape[2]
-    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unshown))
+    unobservable = nuisance.columns.shape[2] - columns.shape[2]
+    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unobservable))
     score_tests: list[FollowTest] = []
     raw: dict[str, Array] = {}
     for name, functions in dictionary(problem, seen).items():
@@ -188,10 +188,10 @@ def _orthogonal_to_nuisances(known: NuisanceFit, columns: Array, white: Array) -
 def _inflation_under_null(fitter: Fitter, fit: Fit, score_tests: Sequence[FollowTest]) -> list[float]:
     """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
     energy, dof = np.full(len(score_tests), PRIOR_DOF), np.full(len(score_tests), PRIOR_DOF)
-    for other, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
-        found, *_ = _score_tests(fitter, fit, other, seen, residual)
-        energy += [test.energy for test in found]
-        dof += [test.dof for test in found]
+    for simulated, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
+        tests, *_ = _score_tests(fitter, fit, simulated, seen, residual)
+        energy += [test.energy for test in tests]
+        dof += [test.dof for test in tests]
     return np.maximum(energy / dof, 1.0).tolist()
 
 
@@ -212,41 +212,41 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
     """
     found = []
     for index, recording in enumerate(problem.recordings):
-        at = problem.recording_of == index
+        rows = problem.recording_of == index
         step = SHORTEST_PERIOD_S / 5.0
         time = problem.time
-        steps = np.diff(time[at])
-        shorter = shortened(steps, STEPS_OF_A_BIN * step * np.count_nonzero(at))
+        steps = np.diff(time[rows])
+        shorter = shortened(steps, STEPS_OF_A_BIN * step * np.count_nonzero(rows))
         if shorter is not steps:
             time = time.copy()
-            time[at] = time[at][0] + np.append(0.0, np.cumsum(shorter))
-        position = ((time[at] - time[at][0]) / step).astype(int)
-        sums = np.stack([np.bincount(position, series) for series in innovations[at].T])
+            time[rows] = time[rows][0] + np.append(0.0, np.cumsum(shorter))
+        position = ((time[rows] - time[rows][0]) / step).astype(int)
+        sums = np.stack([np.bincount(position, series) for series in innovations[rows].T])
         n = 2 * sums.shape[1]  # twice the resolution of independent frequencies
         frequency = np.fft.rfftfreq(n, step)
-        power = 2.0 * np.abs(np.fft.rfft(sums, n)) ** 2 / np.count_nonzero(at)  # chi-square of 2 degrees of freedom
-        inside = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
-        if not inside.any():
+        power = 2.0 * np.abs(np.fft.rfft(sums, n)) ** 2 / np.count_nonzero(rows)  # chi-square of 2 degrees of freedom
+        band = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
+        if not band.any():
             continue
-        log_p = np.vstack([chi2_logsf(power, 2), chi2_logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, inside]
+        log_p = np.vstack([chi2_logsf(power, 2), chi2_logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, band]
         best = int(np.argmin(log_p.min(axis=0)))
-        period = 1.0 / float(frequency[inside][best])
+        period = 1.0 / float(frequency[band][best])
         phase = 2.0 * np.pi * time / period
-        waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
+        waves = np.where(rows[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
         found.append(SpectralLine(period, float(log_p.min() + np.log(log_p.size)), waves))
     return found
 
 
-def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
+def is_predictive(problem: Problem, fit: Fit, unexplained: Unexplained) -> bool:
     """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
-    return rest.found and _is_predictive(problem, fit, rest.clearest, rest.price)
+    return unexplained.found and _is_predictive(problem, fit, unexplained.clearest, unexplained.penalty)
 
 
-def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
+def _is_predictive(problem: Problem, fit: Fit, columns: Array, min_gain: float) -> bool:
     """Return whether columns (M, A, c), added to a fit, gain more than the least in held-out deviance."""
     slow = SlowNoiseOfFit.of_fit(problem, fit)
-    gain = predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
-    return gain > least - columns.shape[2]
+    gain = predictive_gain(problem, slow, slow.with_nuisance(problem, fit.noise, columns))
+    return gain > min_gain - columns.shape[2]
 
 
 def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
@@ -256,28 +256,28 @@ def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Un
     cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
     """
     fitter, fit = selection.fitter, selection.fit
-    problem, rest = fitter.problem, unexplained(fitter, fit)
+    problem, unexplained = fitter.problem, find_unexplained(fitter, fit)
     best: tuple[float, EffectSelection, Unexplained] | None = None
     for out in _subsets(selection):
         reduced = selection.without({effect.name for effect in out})
         drop = reduced.fit.deviance - fit.deviance
         if drop > SETTINGS.instead_of:
             continue
-        other = unexplained(fitter, reduced.fit)
-        if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
+        new = find_unexplained(fitter, reduced.fit)
+        if not new.found or is_of_group(problem, fit, out, new.about) or not is_predictive(problem, reduced.fit, new):
             continue
-        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
+        gain = _held_out_gain(problem, fit, reduced.fit, new) - SETTINGS.indistinguishable - INEXACT * drop
         if gain > 0.0 and (best is None or gain > best[0]):
-            best = gain, reduced, other
-    return (selection, rest) if best is None else best[1:]
+            best = gain, reduced, new
+    return (selection, unexplained) if best is None else best[1:]
 
 
-def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
+def _held_out_gain(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
     """Return the held-out deviance gain of an unmodelled regressor over the removed effects."""
-    whole, rest = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
-    rest = rest.and_rest(other.clearest, reduced.residual)
-    effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
-    return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
+    full, reduced_fit = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
+    reduced_fit = reduced_fit.and_nuisance(other.clearest, reduced.residual)
+    effects = held_out_deviance(problem, fit.noise, full, fit.residual)
+    return effects - held_out_deviance(problem, fit.noise, reduced_fit, reduced.residual)
 
 
 def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
@@ -285,11 +285,11 @@ def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
-def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
+def nuisance_shift(problem: Problem, fit: Fit, unexplained: Unexplained) -> Array:
     """Return the shift (6 + p,) of a fit's parameters with the most significant columns as nuisance."""
-    both = SlowNoiseOfFit.of_fit(problem, fit).with_rest(problem, fit.noise, rest.clearest)
-    stands = both.known._replace(centre=np.zeros_like(both.known.centre))  # linearised at the fit, whatever its prior
-    return stands.step(both.noise, fit.residual).solution()[: fit.columns.shape[2]]
+    slow = SlowNoiseOfFit.of_fit(problem, fit).with_nuisance(problem, fit.noise, unexplained.clearest)
+    system = slow.known._replace(centre=np.zeros_like(slow.known.centre))  # linearised at the fit, whatever its prior
+    return system.step(slow.noise, fit.residual).solution()[: fit.columns.shape[2]]
 
 
 def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: str | float) -> bool:
@@ -304,11 +304,11 @@ def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: st
     own = [6 + at for at, each in enumerate(parameters) if each.effect in effects]
     functions = _along_axes(groups[about], problem.axes)
     calibration = orthonormal(noise.whiten(fit.columns[:, :, :6]))
-    asked = noise.whiten(fit.columns[:, :, own])
-    asked = asked - calibration @ (calibration.T @ asked)
+    own_columns = noise.whiten(fit.columns[:, :, own])
+    own_columns = own_columns - calibration @ (calibration.T @ own_columns)
     group = orthonormal(np.concatenate([calibration, noise.whiten(functions)], axis=1))
-    left = asked - group @ (group.T @ asked)
-    return bool(((left**2).sum(axis=0) < OF_GROUP * (asked**2).sum(axis=0)).all())
+    residual = own_columns - group @ (group.T @ own_columns)
+    return bool(((residual**2).sum(axis=0) < OF_GROUP * (own_columns**2).sum(axis=0)).all())
 
 
 def _along_axes(functions: Array, axes: int) -> Array:

@@ -19,7 +19,7 @@ from dvl_calib_ros.calibration.filters import filter_bank
 from dvl_calib_ros.calibration.models import BY_VELOCITY, LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.streams.aligner import whereabouts
+from dvl_calib_ros.calibration.streams.aligner import counts_by_use
 
 PHI, SCALE = (2e-5, -3e-5, 4e-5), 3e-5
 EXACT = MatchedRun(phi=PHI, scale=SCALE)
@@ -405,7 +405,7 @@ def test_at_any_time_each_dvl_sample_that_came_is_in_one_place(seed, block_size)
     def where(name: str) -> dict[str, int]:
         estimate = calibrator.estimate(name)
         given = calibrator.n_given(name)
-        return whereabouts(calibrator.counts, MODELS[name].needs, given, estimate.used, estimate.gated)
+        return counts_by_use(calibrator.counts, MODELS[name].needs, given, estimate.used, estimate.gated)
 
     for _ in range(400):
         at += source.choice(steps)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.checks.heading_deviation import heading_deviation, heading_warnings
+from dvl_calib_ros.calibration.checks.heading_deviation import heading_deviation, heading_warning
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
@@ -57,7 +57,7 @@ def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
     assert found.rms == pytest.approx(size / math.sqrt(2.0), rel=0.25)
     if cycles == 1:  # most at the heading next to yaw 90 degrees, which is north
         assert min(found.most_at, 2.0 * math.pi - found.most_at) < 0.25
-    said = heading_warnings(found)
+    said = heading_warning(found)
     assert said.code == "HEADING_DEVIATION" and "with the heading" in said.says and "compass first" not in said.remedy
 
 

@@ -35,7 +35,7 @@ def test_all_that_blocks_are_registered_and_judged_by_is_kept(kept):
 
 
 def test_of_more_blocks_the_newest_are_kept_and_room_does_not_grow(kept, monkeypatch):
-    monkeypatch.setattr(registration_schedule, "MOST", 5)
+    monkeypatch.setattr(registration_schedule, "KEPT_BLOCKS", 5)
     seen = registration_schedule._Registered()
     seen.take_room()
     for each in [*kept, *kept]:

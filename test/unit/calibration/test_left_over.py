@@ -283,18 +283,6 @@ def test_a_filter_of_the_dvl_is_named_where_its_lag_was_taken_for_a_late_clock(s
     assert said.severity is Severity.REJECT and said.code == "CIRCULAR_REFERENCE"
 
 
-def test_a_filter_that_finds_nothing_of_the_dvl_may_be_its_own(rng):
-    """Beside noise of 0.06 m/s that of the DVL does not show any more; an instrument as smooth says the same."""
-    vehicle = Vehicle(rng)
-    vehicle.noise = 2.0 * vehicle.noise[0], vehicle.noise[1]
-    found = made_by_a_filter(vehicle)._replace(circular=0.05, circular_std=0.05)
-    assert [each.code for each in residual_warnings(found)] != ["FILTER_FINDS_NOTHING"]
-    assert [each.code for each in residual_warnings(found, lag_s=2.5, finds_nothing=True)] != ["FILTER_FINDS_NOTHING"]
-    assert [each.code for each in residual_warnings(found, lag_s=0.45)] != ["FILTER_FINDS_NOTHING"]
-    (said,) = residual_warnings(found, lag_s=0.45, finds_nothing=True)
-    assert said.severity is Severity.REJECT and said.code == "FILTER_FINDS_NOTHING"
-
-
 @pytest.mark.parametrize(("smoothed", "codes"), [(0.13, ["CIRCULAR_REFERENCE"]), (0.11, []), (-0.13, [])])
 def test_smoothing_and_noise_that_is_passed_on_show_a_filter_together(rng, smoothed, codes):
     """Legs with a filter of 0.5 s and 5 cm/s of noise: followed by 4.4 σ, smoothed by 2.2, and accepted."""

@@ -207,7 +207,7 @@ def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
         *Assembler([model], parameters).start,
         kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([[gate]])),
     )
-    after, k = group.standing(1), group.index[name]
+    after, k = group.snapshot(1), group.index[name]
     np.testing.assert_allclose(after.x[0, k], alone.x[0], atol=1e-12)
     np.testing.assert_allclose(after.p[0, k], alone.p[0], atol=1e-12)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,15 +128,12 @@ def test_ten_hours_take_seconds_and_keep_a_bounded_track():
     assert found is not None and len(found.reference) <= 1500 and found.stretch_m == pytest.approx(1000.0, rel=0.01)
 
 
-def test_a_correction_that_makes_the_track_worse_is_rejected_where_velocities_do_not_fit_clearly_better():
+def test_a_correction_that_makes_the_track_significantly_worse_is_rejected():
     data = recording(1500.0, phi=(0.0, 0.0, 0.2 * YAW))
     worse = navigated(data, Terms(np.array([0.0, 0.0, -0.5 * YAW, 0.0, 0.0, 0.0]), np.zeros(3), 0.0))
     (found,) = objections(worse)
     assert found.code == "DRIFT_WORSE" and found.severity is Severity.REJECT
     assert (found.numbers["after"], found.numbers["before"]) == pytest.approx((12.0, 3.5), abs=0.5)
-    # surveys 34138 and 38447: over a box a wrong yaw cancels, and noise that lasts does not
-    fits = replace(worse, error_before=np.full((50, 3), 0.06), error_after=np.full((50, 3), 0.02))
-    assert [each.severity for each in objections(fits)] == [Severity.MARGINAL]
     # combination 602: on a leg yaw was known to 20 m per km, and 11.6 of it were a reject
     assert [each.severity for each in objections(worse, 10.0)] == [Severity.MARGINAL]
     assert [each.severity for each in objections(worse, 5.0)] == [Severity.REJECT]

@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.registration import registration
-from dvl_calib_ros.calibration.registration.configuration_check import fitting_configuration
+from dvl_calib_ros.calibration.registration.configuration_check import SIGNS, fitting_configuration, wrong_axes
 from dvl_calib_ros.calibration.registration.delay_search import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.registration.gauss_newton import (
     DELTA,
@@ -318,6 +318,20 @@ def test_a_left_handed_driver_at_90_degrees_is_named_with_its_axis(axis):
     found = register(made, quarter, np.zeros(3))
     said = fitting_configuration(made, VelocityFrame.ENU, found, QUARTER)
     assert said and (said.code, said.numbers) == ("DVL_LEFT_HANDED", {"axis": axis, "alike": ""})
+
+
+def test_a_scale_of_one_axis_is_judged_by_the_residual_with_that_scale():
+    """A registration with clocks of its own fitted better than a DVL without the scale."""
+    (td, v), (tg, g), (ti, q, w) = run("free", 5.0)
+    heave = 0.1 * np.sin(2.0 * np.pi * np.outer(td, [0.0, 0.0, 1.0]) / 9.0)
+    right, half = (
+        make_motion((td, (v + heave) * [1.0, 1.0, z]), (tg, g + heave), True, (True,) * 3, ImuColumns(ti, q, w))
+        for z in (1.0, 0.5)
+    )
+    level = MotionFit(right, np.zeros(3), Curves(right))(0.0, 0.0, np.eye(3), (REFERENCE,)).level
+    wrong = wrong_axes(half, Curves(half), np.eye(3), np.zeros(3), 1.01 * level, "from_message", SIGNS)
+    assert wrong is not None and wrong.code == "DVL_AXIS_SCALED"
+    assert wrong.numbers["factor"] == pytest.approx(0.5, abs=0.05)
 
 
 def test_noise_of_the_axis_across_is_no_scale_of_the_axis_ahead(rng):

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.diagnosis.answer.confidence_intervals import with_unshown_turns
+from dvl_calib_ros.diagnosis.answer.confidence_intervals import with_unobservable_turns
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
@@ -162,12 +162,12 @@ def test_what_a_mounting_that_moved_turned_in_pitch_as_well_is_known_beside_it()
     of_pitch = problem.residual(problem.all_seen(turned(usual["mounting_moved"], y_rad=0.07))) - problem.residual(seen)
     left = [of_pitch.ravel()]
     for hypothesis in (no_effect(), by_yaw):
-        columns, sizes = problem.unshown_columns(hypothesis, seen)
+        columns, sizes = problem.unobservable_columns(hypothesis, seen)
         own = columns.reshape(-1, len(sizes)) * sizes
         left.append(of_pitch.ravel() - own @ np.linalg.lstsq(own, of_pitch.ravel(), rcond=None)[0])
     nothing, of_others, with_it = (float(each @ each) for each in left)
     assert with_it < 0.01 * nothing < 0.2 * of_others
     fit = Fitter(problem).fit(by_yaw, white_noise(problem.residual(seen), problem.segments, None, problem.interval))
     covariance = fit.covariance(blocks_of(problem))
-    grown = np.diag(with_unshown_turns(problem, fit, covariance)) / np.diag(covariance)
+    grown = np.diag(with_unobservable_turns(problem, fit, covariance)) / np.diag(covariance)
     assert grown[-1] > 1.4 and grown.min() > 0.99  # so an interval of the yaw holds what is not shown

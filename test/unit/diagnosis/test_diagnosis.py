@@ -32,7 +32,7 @@ from dvl_calib_ros.diagnosis.model.time_grid import Grid, Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.noise.whitened_least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.search import candidates, observable_parameters
-from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_delays, moved_arm, with_moved
+from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, arm_change, lags_and_delays, with_changes
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     repeated_effects,
 )
@@ -45,7 +45,7 @@ from dvl_calib_ros.diagnosis.search.clock_jumps import (
     time_by_stamps,
     with_jumps_in_gaps,
 )
-from dvl_calib_ros.diagnosis.search.clock_jumps import _found as _delays
+from dvl_calib_ros.diagnosis.search.clock_jumps import _best_delays as _delays
 from dvl_calib_ros.diagnosis.search.effect_selection import (
     started,
     with_noise_reestimated,
@@ -56,7 +56,7 @@ from dvl_calib_ros.diagnosis.search.observable_parameters import (
     with_observable,
     without_insignificant,
 )
-from dvl_calib_ros.diagnosis.search.unexplained import Unexplained, _plainest
+from dvl_calib_ros.diagnosis.search.unexplained import Unexplained, _simplest
 from dvl_calib_ros.effects.base import ActsOn
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -285,7 +285,7 @@ def test_a_pitch_of_the_mounting_that_is_not_shown_is_no_coupling_to_tilt():
     errors = DvlErrors((0.02, 0.1, 0.01), (0.005,) * 3, beam_std=0.002)
     given = scenario(gnss_std=0.004, waves=Waves(0.06, 6.0), seed=1, dvl_rate=5.0, gnss_rate=5.0, errors=errors)
     diagnosis = diagnose_recordings([recording_of(simulate(given), given.gnss_frame, axes="xy")], Parameters())
-    assert diagnosis.selection is not None and np.trace(diagnosis.selection.fitter.problem.shown_turns) < 1.5
+    assert diagnosis.selection is not None and np.trace(diagnosis.selection.fitter.problem.observable_turns) < 1.5
     assert diagnosis.verdict not in CLAIMS
 
 
@@ -295,8 +295,8 @@ def test_a_turn_that_is_not_shown_and_that_the_mounting_found_has_is_not_left_at
     given = scenario(gnss_std=0.004, waves=Waves(0.06, 6.0), seed=1, dvl_rate=5.0, gnss_rate=5.0, errors=errors)
     recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
     problem, start, (guess,), _ = started([recording], np.eye(3), np.zeros(3), EFFECTS)
-    assert guess.phi[1] == pytest.approx(-0.2, abs=0.05) and np.trace(problem.shown_turns) < 1.5
-    np.testing.assert_allclose(problem.shown_turns @ start.phi, start.phi, atol=1e-12)
+    assert guess.phi[1] == pytest.approx(-0.2, abs=0.05) and np.trace(problem.observable_turns) < 1.5
+    np.testing.assert_allclose(problem.observable_turns @ start.phi, start.phi, atol=1e-12)
     assert start.phi[2] == pytest.approx(-0.01, abs=0.02)
 
 
@@ -308,11 +308,13 @@ def test_what_is_not_shown_of_an_effect_is_its_where_it_is_named():
     problem, start, _, testable = started([recording], np.eye(3), np.zeros(3), every)
     tilt = every["tilt_coupling"]
     roll = tilt.without({spec.name for spec in tilt.parameters} - {"y_per_roll"})
-    problem = replace(problem, unshown=observable_parameters.unobservable_parts({tilt.name: tilt}, {tilt.name: roll}))
+    problem = replace(
+        problem, unobservable=observable_parameters.unobservable_parts({tilt.name: tilt}, {tilt.name: roll})
+    )
     seen = problem.all_seen(start)
-    turns = problem.unshown_columns(start, seen)[0].shape[2]
+    turns = problem.unobservable_columns(start, seen)[0].shape[2]
     named = start.with_effects([*start.effects, roll], 1, {roll.name: ({"y_per_roll": -0.9},)})
-    columns, sizes = problem.unshown_columns(named, seen)
+    columns, sizes = problem.unobservable_columns(named, seen)
     assert columns.shape[2] == len(sizes) == turns + 3
     of_pitch = problem.columns(named, seen, tilt, (tilt.defaults,))[:, :, 0]
     np.testing.assert_allclose(columns[:, :, turns], of_pitch, atol=1e-9)
@@ -324,7 +326,7 @@ def test_messages_that_claim_another_noise_than_they_have_make_no_effect(share):
     given = scenario(seconds=600.0, dvl_rate=5.0, gnss_rate=5.0, gnss_std=0.015, seed=11)
     honest = recording_of(simulate(given))
     dvl_std, reference_std = np.full(3, share * 0.004), np.full(3, share * 0.015)
-    dvl, reference = replace(honest.dvl, claimed=dvl_std), replace(honest.reference, claimed=reference_std)
+    dvl, reference = replace(honest.dvl, reported=dvl_std), replace(honest.reference, reported=reference_std)
     claiming = replace(honest, dvl=dvl, reference=reference, dvl_std=dvl_std, reference_std=reference_std)
     assert diagnose_recordings([claiming], Parameters()).verdict not in CLAIMS
 
@@ -936,9 +938,9 @@ def test_a_quiet_curve_keeps_the_motion_and_loses_noise(rng):
     true = np.column_stack([np.sin(0.3 * time), np.cos(0.2 * time), 0.0 * time])
     noisy = Curve(time, true + rng.normal(0.0, 0.05, true.shape))
     np.testing.assert_allclose(noisy.roughness, 0.05, rtol=0.1)
-    assert np.std(noisy.quiet.values - true) < 0.5 * 0.05
+    assert np.std(noisy.denoised.values - true) < 0.5 * 0.05
     clean = Curve(time, true)
-    np.testing.assert_allclose(clean.quiet.values, true, atol=1e-3)
+    np.testing.assert_allclose(clean.denoised.values, true, atol=1e-3)
 
 
 def test_whitened_coloured_noise_is_white_and_comes_back(rng):
@@ -1103,15 +1105,15 @@ def test_a_stretch_is_left_open_by_no_more_than_what_it_has_beyond_the_noise():
     residuals = HeldOutResiduals(
         after, after, np.ones((6, 1)), np.array([0, 0, 1, 1, 2, 2]), np.array([900.0, 1.0, 0.5, 0.5, 7.0, 0.0])
     )
-    np.testing.assert_allclose(residuals.open_of_blocks(), [6.0, 1.0, 0.0])
+    np.testing.assert_allclose(residuals.undetermined_of_blocks(), [6.0, 1.0, 0.0])
 
 
 def test_what_is_left_beyond_all_doubt_is_told_by_what_explains_it():
     """p of 0 was no likelier than itself, and the diagnosis ended in a traceback."""
     wide, narrow = np.zeros((4, 2, 3)), np.zeros((4, 2, 1))
     tests = [(-np.inf, "turn rate", wide), (-np.inf, "speed", narrow), (-20.0, "time", narrow[:, :, :0])]
-    assert _plainest(tests, -np.inf)[1] == "speed"
-    assert _plainest(tests[2:], -20.0)[1] == "time"
+    assert _simplest(tests, -np.inf)[1] == "speed"
+    assert _simplest(tests[2:], -20.0)[1] == "time"
 
 
 @pytest.mark.parametrize("name", ["lever_arm", "quadratic_scale", "mount_flexure", "attitude_time_offset"])
@@ -1209,8 +1211,8 @@ def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped():
     there_were, there_are = (no_effect().with_effects(some, 1, values) for some in ([lag, arm], [arm.without({"z_m"})]))
     fit = Mock(spec=Fit, hypothesis=there_were, values=there_were.values)
     near, far = ({arm.name: ({"x_m": x, "y_m": 0.2},)} for x in (0.6, 0.9))
-    moved = moved_arm(fit, [Mock(spec=Hypothesis, values=each) for each in (near, far, {})])
-    added = with_moved(Mock(spec=Fit, hypothesis=there_are), np.eye(8), moved) - np.eye(8)
+    moved = arm_change(fit, [Mock(spec=Hypothesis, values=each) for each in (near, far, {})])
+    added = with_changes(Mock(spec=Fit, hypothesis=there_are), np.eye(8), moved) - np.eye(8)
     expected = np.zeros((8, 8))
     expected[6:, 6:] = np.outer([0.4, 0.1], [0.4, 0.1])
     np.testing.assert_allclose(added, expected, atol=1e-12)

@@ -9,7 +9,8 @@ import pytest
 from conftest import ROOT
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.registration.unregistrable_clocks import STEP_S, lag
+from dvl_calib_ros.calibration.registration.delay_search import STEP_S
+from dvl_calib_ros.calibration.registration.unregistrable_clocks import lag
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.model.stream_curve import Curve

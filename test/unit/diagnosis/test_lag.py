@@ -16,7 +16,7 @@ from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import white_noise
-from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import moved_lag, with_moved
+from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import lag_change, with_changes
 from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -124,9 +124,9 @@ def test_a_lag_beside_free_clocks_may_be_what_it_is_without_them(worse, std):
         Mock(spec=Fit, hypothesis=each, values=each.values, deviance=deviance)
         for each, deviance in ((alone, 100.0 + worse), (both, 100.0))
     )
-    found = with_moved(joint, 0.1**2 * np.eye(8), moved_lag(fit, joint))
+    found = with_changes(joint, 0.1**2 * np.eye(8), lag_change(fit, joint))
     np.testing.assert_allclose(np.sqrt(np.diag(found)), [*[0.1] * 7, std], atol=0.005)
-    assert not moved_lag(Mock(spec=Fit, values={}), joint)
+    assert not lag_change(Mock(spec=Fit, values={}), joint)
 
 
 def test_made_up_recordings_lag_as_the_fit_does():

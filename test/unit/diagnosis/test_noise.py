@@ -15,7 +15,7 @@ from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import blocks_of
-from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, followed
+from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, relative_std
 from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, make_recording
@@ -23,7 +23,7 @@ from dvl_calib_ros.diagnosis.model.settings import SETTINGS
 from dvl_calib_ros.diagnosis.model.stream_curve import Curve
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise import noise_level
-from dvl_calib_ros.diagnosis.noise.noise_level import claims_of
+from dvl_calib_ros.diagnosis.noise.noise_level import log_reported
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.search.effect_selection import without_slow_outliers
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -143,8 +143,8 @@ def test_the_exponent_of_a_claim_is_found_whatever_the_noise_is_in_all():
         values = 0.02 * np.exp(exponent * claims) * rng.standard_normal(claims.shape)
         found = exponents(["reference"], claims[:, :, None], values, stretch)
         assert found.exponents[0] == pytest.approx(exponent, abs=4.0 * found.stds[0])
-        assert bool(found.sure[0]) == (exponent > 0.0)
-        relative = followed(claims[:, :, None], values, ["reference"], stretch)
+        assert bool(found.is_significant[0]) == (exponent > 0.0)
+        relative = relative_std(claims[:, :, None], values, ["reference"], stretch)
         assert np.std(np.log(relative) - exponent * (claims - claims.mean(axis=0))) < 0.1
 
 
@@ -160,7 +160,7 @@ def test_claims_of_the_earths_axes_are_turned_into_the_frame_of_the_noise():
     problem = make_problem([run], np.eye(3), np.zeros(3), [Offsets()])
     seen = problem.all_seen(no_effect())
     for rotation, order in ((None, [1, 0, 2]), (problem.earth_from_compared, [0, 1, 2])):
-        names, claims = claims_of(problem, seen, rotation)
+        names, claims = log_reported(problem, seen, rotation)
         assert names == ("reference",)
         early = problem.time < 49.0
         expected = np.log(np.array([0.1, 0.02, 0.05])[order])
@@ -311,7 +311,7 @@ def test_noise_keeps_the_colour_of_what_a_fit_has_taken_in(keep, low):
             white = noise.whiten(columns)
             left = series - columns @ np.linalg.lstsq(white, noise.whiten(series), rcond=None)[0]
             for _ in range(2):
-                noise = noise.refitted(left, taken=noise.taken_by(columns, std))
+                noise = noise.refitted(left, absorbed=noise.absorbed_by(columns, std))
         restricted.append(_at_rest(noise) / _at_rest(drawn))
         plain.append(_at_rest(noise.refitted(left)) / _at_rest(drawn))
     assert low < np.median(restricted) < 1.1
@@ -329,8 +329,8 @@ def test_the_mean_of_slow_noise_is_inside_the_interval_of_what_its_memory_may_be
         series = slow.unwhiten(rng.standard_normal(3 * n)) + rng.normal(0.0, 0.01, (n, 3))
         noise, left = replace(white, memory=float(np.exp(-0.01))), series - series.mean(axis=0)
         for _ in range(3):
-            noise = noise.refitted(left, taken=noise.taken_by(columns, std))
-        drawn = noise.drawn(left, noise.taken_by(columns, std), 100, rng)
+            noise = noise.refitted(left, absorbed=noise.absorbed_by(columns, std))
+        drawn = noise.drawn(left, noise.absorbed_by(columns, std), 100, rng)
         inside.append(np.abs(series.mean(axis=0)) < 1.96 * np.std([each.mean(axis=0) for each in drawn], axis=0))
     assert np.mean(inside) > 0.88
 
@@ -376,8 +376,8 @@ def test_tails_of_noise_are_known_from_samples_that_are_close(rng, degrees, low,
     time = np.arange(1850) / 5.0
     white = rng.standard_t(degrees, (1850, 3)) / np.sqrt(3.0) if degrees else rng.standard_normal((1850, 3))
     curve = Curve(time, np.sin(time[:, None] / [3.0, 5.0, 7.0]) + 0.01 * white)
-    assert low <= curve.tails <= high
-    assert curve.part(np.arange(1850) % 5 == 0).tails == 1.0
+    assert low <= curve.noise_excess <= high
+    assert curve.part(np.arange(1850) % 5 == 0).noise_excess == 1.0
 
 
 def test_what_heavy_tails_add_to_the_noise_that_a_lag_takes_off_is_not_explained(monkeypatch):
@@ -388,8 +388,8 @@ def test_what_heavy_tails_add_to_the_noise_that_a_lag_takes_off_is_not_explained
     lag = EFFECTS["reference_lag"]
     start = no_effect().with_effects([lag], 1, {lag.name: ({"time_constant_s": 0.4},)})
     gains = []
-    for tails in ((1.0, 1.0), (1.5, 1.5)):
-        monkeypatch.setattr(Problem, "tails", tails[: len(problem.shaken)])
+    for noise_excess in ((1.0, 1.0), (1.5, 1.5)):
+        monkeypatch.setattr(Problem, "noise_excess", noise_excess[: len(problem.perturbed)])
         rest, fit = fitter.fit(no_effect(), noise), fitter.fit(start, noise, fixed=frozenset([lag.name]))
         gains.append(fit.gain_over(rest))
     taken_off = float(rest.own_noise @ rest.own_noise - fit.own_noise @ fit.own_noise)
@@ -418,7 +418,7 @@ def test_an_outlier_does_not_shift_the_level_of_slow_noise():
 def test_an_event_is_whitened_from_the_bins_about_it_alone(rng):
     arma = Arma(np.array([0.95]), -0.6, 0.02, 1.5)
     noise = Noise((slice(0, 150), slice(150, 400)), None, rng.uniform(0.5, 2.0, (400, 3)), (arma,) * 3)
-    event, about = np.zeros((400, 3)), slice(139, 164 + noise.fading)
+    event, about = np.zeros((400, 3)), slice(139, 164 + noise.memory_samples)
     event[140:164] = rng.normal(size=(24, 3))
     whole = noise.whiten(event).reshape(400, 3)
     np.testing.assert_allclose(noise.part(about).whiten(event[about]).reshape(-1, 3), whole[about], atol=1e-9)

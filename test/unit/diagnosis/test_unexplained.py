@@ -13,7 +13,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.diagnosis.answer.gap_location import places
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.fit.cross_validation import surprise_elsewhere
+from dvl_calib_ros.diagnosis.fit.cross_validation import held_out_deviance
 from dvl_calib_ros.diagnosis.fit.gauss_newton import SURELY, Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import NuisanceFit
 from dvl_calib_ros.diagnosis.model.forward_model import make_problem
@@ -25,9 +25,9 @@ from dvl_calib_ros.diagnosis.search import unexplained as looking
 from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
 from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import (
+    find_unexplained,
     is_of_group,
-    matters,
-    unexplained,
+    is_predictive,
     without_replaceable,
 )
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -80,7 +80,7 @@ def test_what_a_step_from_a_fit_at_rest_promises_is_promised_of_no_hypothesis_ne
     given = scenario("lawnmower", seconds=300.0, errors=errors, dvl_rate=1.0, gnss_rate=5.0, gnss_std=0.02)
     effects = {"lever_arm": {}, "dvl_time_offset": {}, "reference_time_offset": {}}
     fitter, fit, _ = fitted(given, effects)
-    promised, looked = fitter._promised(fit), fitter._linearised(fit.hypothesis, fit.noise)
+    promised, looked = fitter._predicted_gain(fit), fitter._linearised(fit.hypothesis, fit.noise)
 
     def is_surely_worse(by: float, promised: float) -> bool:
         return fitter._is_surely_worse(fit.hypothesis, looked, fit.noise, fit.deviance - by, promised)
@@ -96,7 +96,7 @@ def test_lines_are_looked_for_in_what_a_fit_leaves(stepped, monkeypatch):
     off = replace(fit, residual=fit.residual - 0.003 * fit.columns[:, :, 3])  # as what noise in the columns makes of it
     seen = []
     monkeypatch.setattr(looking, "lines", lambda _, innovations: seen.append(innovations) or [])
-    unexplained(fitter, off)
+    find_unexplained(fitter, off)
     white = fit.noise.whiten(off.residual).reshape(off.residual.shape)
     np.testing.assert_allclose(seen[0] / np.sqrt(np.mean(seen[0] ** 2)), white / np.sqrt(np.mean(white**2)))
 
@@ -111,17 +111,17 @@ def with_a_wave(seconds, velocity):
 def test_what_is_left_of_a_heave_that_is_hardly_there_is_there_elsewhere_as_well():
     """A scale of the heave, free to be anything, took it in wherever it was fitted to: -19 were told, and no gap."""
     fitter, fit = with_a_wave(118.0, (0.0, 0.0, 0.01))
-    rest = unexplained(fitter, fit)
+    rest = find_unexplained(fitter, fit)
     assert rest.about == pytest.approx(118.0, rel=0.05)
-    assert matters(fitter.problem, fit, rest)
+    assert is_predictive(fitter.problem, fit, rest)
 
 
 def test_a_period_that_no_function_of_time_follows_matters():
     """Of no group it counted for nothing: with 56 in units of the noise it was too little to matter."""
     fitter, fit = with_a_wave(18.0, (0.0, 0.008, 0.0))
-    rest = unexplained(fitter, fit)
+    rest = find_unexplained(fitter, fit)
     assert rest.about == pytest.approx(18.0, rel=0.05)
-    assert matters(fitter.problem, fit, rest)
+    assert is_predictive(fitter.problem, fit, rest)
 
 
 def test_what_is_not_shown_is_no_finding_under_noise_that_is_estimated_anew_either(monkeypatch):
@@ -131,9 +131,9 @@ def test_what_is_not_shown_is_no_finding_under_noise_that_is_estimated_anew_eith
     fitter, fit = without_effects(recording_of(simulate(scenario("lawnmower", gnss_std=0.03))))
     height = fitter.problem.columns(fit.hypothesis, fit.seen, arm, [arm.defaults])
     off = replace(fit, residual=fit.residual + 0.015 / np.sqrt(np.mean(height**2)) * height[:, :, 0])
-    assert unexplained(fitter, off).about == "roll and pitch rate"
-    unshown = replace(fitter.problem, unshown=(arm,))
-    assert not unexplained(replace(fitter, problem=unshown), off).found
+    assert find_unexplained(fitter, off).about == "roll and pitch rate"
+    unobservable = replace(fitter.problem, unobservable=(arm,))
+    assert not find_unexplained(replace(fitter, problem=unobservable), off).found
 
 
 def test_one_harmonic_of_the_heading_is_looked_for_by_itself():
@@ -145,9 +145,9 @@ def test_one_harmonic_of_the_heading_is_looked_for_by_itself():
         return 0.01 * np.outer(np.sin(3.0 * heading), [0.0, 1.0, 0.0])
 
     fitter, fit = without_effects(with_added(run, third))
-    rest = unexplained(fitter, fit)
+    rest = find_unexplained(fitter, fit)
     assert rest.about == "heading" and rest.clearest.shape[2] == 6
-    assert matters(fitter.problem, fit, rest)
+    assert is_predictive(fitter.problem, fit, rest)
 
 
 @pytest.mark.slow
@@ -169,7 +169,7 @@ def test_effects_that_an_unknown_cause_may_be_a_part_of_are_not_named_beside_it(
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
     noise = white_noise(fitter.fit(start, noise).residual, problem.segments, None, problem.interval)
     base, fit = fitter.fit(no_effect(), noise), fitter.fit(start, noise)
-    assert unexplained(fitter, fit).found
+    assert find_unexplained(fitter, fit).found
     selected = tuple(Selected(effect, -50.0, ()) for effect in effects)
     left, rest = without_replaceable(EffectSelection(selected, base, fit, fitter, (), EFFECTS))
     assert rest.about == "a step in time"
@@ -187,8 +187,8 @@ def test_what_one_stretch_alone_tells_of_an_effect_is_not_held_against_it_where_
     problem, raw = SimpleNamespace(time=time), column[:, None, None]
     left = noise.whiten(residual - 3.0 * column[:, None])
     explained = float(np.sum(noise.whiten(residual) ** 2) - np.sum(left**2))
-    with_it = surprise_elsewhere(problem, noise, known.and_rest(raw, residual), residual)
-    predicted = surprise_elsewhere(problem, noise, known, residual) - with_it
+    with_it = held_out_deviance(problem, noise, known.and_nuisance(raw, residual), residual)
+    predicted = held_out_deviance(problem, noise, known, residual) - with_it
     assert predicted == pytest.approx(explained, abs=20.0)
 
 
@@ -200,9 +200,9 @@ def test_an_unknown_cause_takes_the_place_of_effects_only_where_it_predicts_bett
     nothing = fit.columns[:, :, :0]
     told = fit.deviance - fitted_with.deviance
     cause = looking.Unexplained(-50.0, "speed", nothing, nothing, told)
-    monkeypatch.setattr(looking, "unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(looking, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(looking, "_better_elsewhere", lambda *_: better)
+    monkeypatch.setattr(looking, "find_unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(looking, "is_predictive", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(looking, "_held_out_gain", lambda *_: better)
     selected = (Selected(drift, -50.0, ()),)
     left, _ = without_replaceable(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS))
     assert bool(left.selected) == kept
@@ -212,7 +212,7 @@ def test_how_sure_the_places_of_a_gap_are_does_not_go_by_how_columns_of_nothing_
     """Of the mounting of a boat that does not tilt only yaw is shown: two columns were rounding, and each took a part
     of the gap with it that nobody could have told before."""
     fitter, _ = without_effects(recording_of(simulate(scenario(effects=[LEVER], seconds=300.0, gnss_std=0.02))))
-    fitter = Fitter(replace(fitter.problem, shown_turns=np.diag([0.0, 0.0, 1.0]), of_axes=(True, True, False)))
+    fitter = Fitter(replace(fitter.problem, observable_turns=np.diag([0.0, 0.0, 1.0]), of_axes=(True, True, False)))
     problem = fitter.problem
     residual = fitter.evaluated(no_effect())[1]
     base = fitter.fit(no_effect(), white_noise(residual, problem.segments, None, problem.interval))
@@ -236,9 +236,9 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     none = fitter.fit(fit.hypothesis.with_effects([], 1, {}), fit.noise)
     nothing, told = fit.columns[:, :, :0], 0.82 * (none.deviance - fit.deviance)
     cause = looking.Unexplained(-50.0, about, nothing, nothing, told)
-    monkeypatch.setattr(looking, "unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(looking, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(looking, "_better_elsewhere", lambda *_: 1000.0)
+    monkeypatch.setattr(looking, "find_unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(looking, "is_predictive", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(looking, "_held_out_gain", lambda *_: 1000.0)
     left, _ = without_replaceable(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
     assert bool(left.selected) == is_some
 
@@ -252,9 +252,9 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
 )
 def test_one_event_is_found_whenever_it_happens(about, third):
     fitter, fit = without_effects(with_added(simulate(scenario("lawnmower", seconds=300.0, gnss_std=0.03)), third))
-    rest = unexplained(fitter, fit)
+    rest = find_unexplained(fitter, fit)
     assert rest.about == about
-    assert matters(fitter.problem, fit, rest)
+    assert is_predictive(fitter.problem, fit, rest)
 
 
 def test_a_magnetic_anomaly_is_a_passage_that_turns_the_heading():
@@ -267,6 +267,6 @@ def test_a_magnetic_anomaly_is_a_passage_that_turns_the_heading():
         return off[:, None] * np.column_stack([-y, x, np.zeros_like(x)])
 
     fitter, fit = without_effects(with_added(run, turned))
-    rest = unexplained(fitter, fit)
+    rest = find_unexplained(fitter, fit)
     assert rest.about == "a passage that turns the heading"
-    assert matters(fitter.problem, fit, rest)
+    assert is_predictive(fitter.problem, fit, rest)

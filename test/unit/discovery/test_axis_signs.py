@@ -17,7 +17,7 @@ CURRENT_MPS = (0.2, 0.1, 0.0)
 ASTERN = (0.0, 0.0, np.pi)
 
 
-def recording(path, signs, current=CURRENT_MPS, mounting=(0.0, 0.0, 0.0), z_down=False, seed=3):
+def recording(path, signs, current=CURRENT_MPS, mounting=(0.0, 0.0, 0.0), said=None, seed=3):
     """Write a DVL, with signs wrong, and an IMU of a vehicle that steers random courses through a current."""
     m = make_motion("free", 600.0, 100.0, np.random.default_rng(seed))
     drift = np.einsum("nji,j->ni", m.rotation_enu_from_body, np.array(current))
@@ -27,7 +27,7 @@ def recording(path, signs, current=CURRENT_MPS, mounting=(0.0, 0.0, 0.0), z_down
         v = message.twist.twist.linear
         v.x, v.y, v.z = np.array([v.x, v.y, v.z]) * signs
     told.imu("/imu/data", "base_link")
-    told.tf_static(told.transform("base_link", "dvl_link", mounting, LEVER_ARM))
+    told.tf_static(told.transform("base_link", "dvl_link", said or mounting, LEVER_ARM))
     return told.write(path)
 
 
@@ -61,8 +61,8 @@ def test_a_sway_that_a_current_contradicts_is_rejected_and_its_remedy_works(tmp_
 def test_a_current_confirms_the_sign_of_y_and_that_of_z_is_asked(tmp_path, seed):
     examined = dc.doctor(recording(tmp_path / "bag", (1.0, 1.0, 1.0), seed=seed))
     (question,) = [each for each in examined.reasons if each.code.startswith("DVL_SI")]
-    assert question.code == "DVL_SIGN_OPEN" and question.numbers["axis"] == "z" and question.numbers["angle"] == "pitch"
-    assert question.numbers["degrees"] == pytest.approx(2.0, abs=0.3)
+    assert question.code == "DVL_SIGN_OPEN" and question.numbers["axis"] == "z"
+    assert float(question.numbers["effect"].removeprefix("the pitch changes by ")[:-1]) == pytest.approx(2.0, abs=0.3)
     assert "positive when the vehicle moves up?" in question.sentence
 
 
@@ -83,3 +83,19 @@ def test_without_a_current_both_signs_are_asked_and_the_answer_is_marginal(tmp_p
     assert calibration.verdict == "marginal"
     assert codes(reasons_of(calibration)).count("DVL_SIGN_OPEN") == 2
     assert not any(each.code == "DOCTOR_FRAMES" for each in dc.doctor(bag).findings)
+    question = next(each for each in reasons_of(calibration) if each.code == "DVL_SIGN_OPEN")
+    answer = changes(question.remedy, Parameters.from_mapping(calibration.replayed.result.parameters))
+    assert answer == {"dvl_axes": "flu"}
+    assert "DVL_SIGN_OPEN" not in codes(reasons_of(dc.replay(bag, history=False, **answer)))
+
+
+def test_a_mirrored_y_with_the_yaw_of_the_other_sign_is_asked(tmp_path):
+    """It was asked for z only; the sign of y and the yaw are wrong at once."""
+    said, signs = (0.0, 0.0, -np.pi / 4.0), (1.0, -1.0, 1.0)
+    bag = recording(tmp_path / "bag", signs, current=(0.0, 0.0, 0.0), mounting=(0.0, 0.0, np.pi / 4.0), said=said)
+    reasons = reasons_of(dc.replay(bag, history=False))
+    (question,) = [each for each in reasons if each.code == "DVL_SIGN_OPEN" and each.numbers["axis"] == "y"]
+    assert "mounting_rpy [0deg,0deg,45deg] fits" in question.sentence
+    assert "positive when the vehicle moves to port?" in question.sentence
+    with_current = recording(tmp_path / "current", signs, mounting=(0.0, 0.0, np.pi / 4.0), said=said)
+    assert codes(reasons_of(dc.replay(with_current, history=False)))[0] == "DVL_SIDE_INVERTED"

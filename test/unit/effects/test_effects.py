@@ -197,7 +197,7 @@ def test_every_effect_describes_itself():
 
 def test_a_parameter_is_said_in_words_and_without_its_unit():
     said = {
-        f"{effect.name} {parameter.name}": parameter.spoken
+        f"{effect.name} {parameter.name}": parameter.display_name
         for effect in (*EFFECTS.values(), *NOISE_EFFECTS.values())
         for parameter in effect.parameters
     }

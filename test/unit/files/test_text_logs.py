@@ -132,7 +132,8 @@ def test_rows_that_are_not_valid_are_left_out(tmp_path, capsys):
     ("columns", "expected"),
     [
         ("time=t,vx=a,vy=b,vz=q", "no column 'q'; there are t, a, b, c, lock"),
-        ("time=t,vx=a,vy=b", "vz is missing; write time=NAME,vx=NAME"),
+        ("time=t,vx=a", "vy is missing; write time=NAME,vx=NAME"),
+        ("time=t,vx=a,vy=b", "vz is missing, and two velocities show no mounting: import the DVL's own log"),
         ("time=t,vx=a,vy=b,vz=c,speed=a", "'speed' is none of time, vx, vy, vz, valid"),
         ("time=lock,vx=lock,vy=lock,vz=lock", "no row with time and velocity"),
     ],

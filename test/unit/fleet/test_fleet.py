@@ -30,7 +30,7 @@ from dvl_calib_ros.fleet_catalogue.update import Catalogue
 from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued, histories, need_person
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 from dvl_calib_ros.present.comparison import QUANTITIES
-from dvl_calib_ros.present.comparison_figures import _draw
+from dvl_calib_ros.present.comparison_figures import _draw_quantity
 from dvl_calib_ros.present.document import Sentence
 from dvl_calib_ros.present.figure_style import new_figure
 from dvl_calib_ros.present.fleet import fleet
@@ -128,7 +128,7 @@ def test_the_page_begins_with_who_needs_a_person_and_draws_an_inverted_dvl_witho
             for each, roll in zip(moved.compared.calibrations[:2], angles, strict=True)
         ]
         axes = new_figure()[1]
-        _draw(axes, compare(turned), QUANTITIES[0])
+        _draw_quantity(axes, compare(turned), QUANTITIES[0])
         assert np.ptp(axes.get_ylim()) < 20.0
 
 

@@ -15,7 +15,7 @@ from dvl_calib_ros.calibration.assessment.dead_reckoning import Drift
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap
-from dvl_calib_ros.diagnosis.answer.plotted_series import Followed
+from dvl_calib_ros.diagnosis.answer.plotted_series import RegressorPlot
 from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.present import diagnosis_pictures
@@ -183,7 +183,7 @@ def test_what_is_left_is_shown_against_what_it_follows_with_means_and_their_erro
     assert "Residual to port, against turn rate" in page.text
     at = np.linspace(-1.0, 1.0, 3000)
     left = 0.01 * at + np.random.default_rng(1).normal(0.0, 0.02, 3000)
-    where, mean, std, error = Followed("turn rate, °/s", "x", at, left).groups()
+    where, mean, std, error = RegressorPlot("turn rate, °/s", "x", at, left).groups()
     assert np.abs(mean - 0.01 * where).max() < 4.0 * error.max()
     assert std == pytest.approx(0.02, rel=0.2) and error == pytest.approx(0.02 / np.sqrt(200.0), rel=0.2)
 

@@ -43,7 +43,7 @@ from dvl_calib_ros.unpaired.gap_ladder import (
     two_samples,
 )
 from dvl_calib_ros.unpaired.results import ComparedEffect, ComparisonStatus, SimulatorVerdict, unpaired_document
-from dvl_calib_ros.unpaired.simulator_rounds import ClosedGap, Round, close_gap, closed_gap_document, put_right
+from dvl_calib_ros.unpaired.simulator_rounds import ClosedGap, Round, close_gap, closed_gap_document, corrected_document
 
 SECOND_NS = 1_000_000_000
 
@@ -138,7 +138,7 @@ def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys
     out, _ = succeed(
         capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], "--report", report, "--json", document
     )
-    assert "The simulator lacks lever_arm. Corrected" in " ".join(out.split())
+    assert "The simulator lacks lever_arm. When corrected" in " ".join(out.split())
     assert json.loads(document.read_text())["verdict"] == "different"
     page = Page(report)
     assert page.row("lever_arm")[1] == "the simulator lacks it"
@@ -290,14 +290,17 @@ def test_rounds_are_written_as_the_schema_says_and_laid_out(closed, tmp_path):
 def test_a_round_changes_sizes_noise_and_rate_by_as_much_as_they_differ(compared):
     document = diagnosis_document(compared.vehicle)
     document["effects"] = []
-    right = put_right(document, compared)
+    right = corrected_document(document, compared)
     (arm,) = right["effects"]
     said = compared.missing[0]
     assert arm["parameters"]["x_m"]["value"] == pytest.approx(said.vehicle["x_m"][0] - said.simulator["x_m"][0])
     level = next(each for each in compared.noise if each.name == "level_x")
     before, after = document["dvl"]["noise_std_mps"][0], right["dvl"]["noise_std_mps"][0]
     assert after == pytest.approx(before * level.vehicle[0] / level.simulator[0])
-    assert document["effects"] == [] and put_right(right, compared)["dvl"]["rate_hz"] == document["dvl"]["rate_hz"]
+    assert (
+        document["effects"] == []
+        and corrected_document(right, compared)["dvl"]["rate_hz"] == document["dvl"]["rate_hz"]
+    )
 
 
 def test_no_round_changes_a_leap_which_is_of_a_time_of_the_vehicles_run(compared):
@@ -308,7 +311,7 @@ def test_no_round_changes_a_leap_which_is_of_a_time_of_the_vehicles_run(compared
     missing = ComparedEffect(
         LEAP, ComparisonStatus.MISSING, (), {"seconds": (0.6, 0.5, 0.7)}, {"seconds": (0.0, -0.1, 0.1)}, 0.0
     )
-    assert put_right(document, replace(compared, effects=(missing,)))["effects"] == document["effects"]
+    assert corrected_document(document, replace(compared, effects=(missing,)))["effects"] == document["effects"]
 
 
 def test_a_round_leaves_a_part_of_an_effect_as_it_is_that_one_side_does_not_show(compared):
@@ -316,7 +319,7 @@ def test_a_round_leaves_a_part_of_an_effect_as_it_is_that_one_side_does_not_show
     document["effects"] = []
     vehicle, simulator = {"x_m": (0.8, 0.7, 0.9)}, {"x_m": (0.0, -0.1, 0.1), "z_m": (0.5, 0.4, 0.6)}
     missing = ComparedEffect("lever_arm", ComparisonStatus.MISSING, (), vehicle, simulator, 0.0)
-    (arm,) = put_right(document, replace(compared, effects=(missing,)))["effects"]
+    (arm,) = corrected_document(document, replace(compared, effects=(missing,)))["effects"]
     assert arm["parameters"] == {"x_m": {"value": 0.8}}
 
 
@@ -474,12 +477,12 @@ def test_one_noise_at_two_speeds_is_one_noise():
     rng = np.random.default_rng(3)
     both = [[scattered(rng, rng.uniform(low, low + 1.5, 3000), 0.6)] for low in (0.2, 1.0)]
     even = at_one_motion(both, [slopes_of(side) for side in both])
-    plain, put_right = (
+    plain, corrected_document = (
         [np.mean([np.exp(block_levels(side, axis)).mean() for axis in range(3)]) for side in sides]
         for sides in (both, even)
     )
     assert plain[1] > 1.4 * plain[0]
-    assert put_right[1] == pytest.approx(put_right[0], rel=0.08)
+    assert corrected_document[1] == pytest.approx(corrected_document[0], rel=0.08)
 
 
 def test_a_dvl_that_copies_its_reference_is_noticed():
