@@ -83,7 +83,11 @@ class Assessor:
         judged: tuple[float, Array],
         suggestion: Reason | None,
     ) -> Verification:
-        """Return the verdict, see `verify`. judged: samples and velocity products, see `calibration_error`."""
+        """Return the verdict on an estimate, see `verify`.
+
+        typical: held-out velocity error without outliers, m/s; None if not needed. judged: number of samples and sum of
+        v vᵀ (3, 3), (m/s)², of the samples judged.
+        """
         name, p = estimate.model, self._estimates.parameters
         model, estimator = MODELS[name], self._estimates.estimators[name]
         of_velocity = self._estimates.of_recording(name).p - estimator.of_bias.covariance

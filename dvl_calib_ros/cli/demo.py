@@ -38,7 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Play, watch, compare. Return the exit code."""
+    """Play the demo bag into a live node and compare its result with an offline replay.
+
+    Return 0 if both agree, else 1.
+    """
     from ..calibration.models import MODELS
 
     if not 0.1 <= arguments.speed <= 1000.0:

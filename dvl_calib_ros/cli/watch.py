@@ -375,7 +375,10 @@ class Keys:
         return key != "q" or self._ends_node
 
     def has_left(self) -> bool:
-        """Return whether q was pressed, its save was answered, and no question is open."""
+        """Return whether the program may end after q: the node has answered the save, and no question is open.
+
+        If the saved result is better, ask whether to replace it.
+        """
         if not self._is_leaving or self._listener.is_waiting or self._own:
             return False
         if WORSE not in self._listener.answer:

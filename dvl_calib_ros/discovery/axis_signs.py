@@ -101,7 +101,7 @@ def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None
 def sign_findings(
     recordings: Sequence[Survey], topics: Topics, parameters: Parameters, axes_are_given: bool
 ) -> Iterator[Reason]:
-    """Yield the finding of axes of the earth, of an inverted sway, or of each open sign that changes the mounting.
+    """Yield findings on the DVL's axes: velocity in the earth frame, inverted y, or an unobservable sign of y or z.
 
     axes_are_given: the user has set dvl_axes, which confirms all signs.
     """
@@ -126,7 +126,7 @@ def sign_findings(
         return
     mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in seen]).mean(axis=0)
     given = body_from_message @ mean
-    straight = np.array([given[0], 0.0, 0.0])
+    ahead_only = np.array([given[0], 0.0, 0.0])
     if math.hypot(given[1], given[2]) >= math.tan(LIKELY) * abs(given[0]):
         return  # no vehicle that travels ahead
     signs = [one for one in each if one is not None and one.sign]
@@ -136,7 +136,7 @@ def sign_findings(
         return
     if axes_are_given:
         return
-    fitted, flips = least_turn(given, straight) @ body_from_message, 1.0 - 2.0 * np.eye(3)
+    fitted, flips = least_turn(given, ahead_only) @ body_from_message, 1.0 - 2.0 * np.eye(3)
     for row in (2,) if signs else (1, 2):
         # the axis most along this row of the body; negated, the mirrored mounting fits as well
         along = np.abs(body_from_message[row]).round(6)

@@ -195,7 +195,7 @@ def dvl_velocities(run: Trajectory, seed: int) -> Array:
 
 
 def references(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) -> Array:
-    """Simulate GNSS velocities (B, N, 3) m/s, with independent noise per combination."""
+    """Simulate a GNSS velocity (B, N, 3) m/s, with noise of its own for each combination of misalignment and scale."""
     return np.stack(
         [
             protocol.reference(run.velocity, protocol.random_stream("gnss", seed, run.name, index), gnss_std)

@@ -81,7 +81,7 @@ def _records(content: bytes) -> Iterator[bytes | None]:
 
 
 def _sum(data: bytes) -> int:
-    """Return Nortek's checksum: of 16-bit words; a last single byte is the upper one of its word."""
+    """Return Nortek's checksum: the sum of 16-bit words, modulo 2^16; an odd last byte is the high byte of a word."""
     even = data[: len(data) & ~1]
     total = _CHECKSUM_START + sum(struct.unpack(f"<{len(even) // 2}H", even))
     return (total + (data[-1] << 8 if len(data) % 2 else 0)) & 0xFFFF

@@ -48,7 +48,7 @@ FOR_EVER_S = 1.0e9
 
 
 def write(description: DvlDescription) -> Settings:
-    """Write all properties, including scale and beam biases."""
+    """Return the settings of a DVL with scale and beam biases, which the simulator draws by its seed."""
     beams = beams_of(description.noise_std, math.radians(BEAM_ANGLE_DEG))
     scale = mixed_scale(description)
     drawn = draws(SEED)

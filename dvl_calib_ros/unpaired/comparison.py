@@ -486,7 +486,10 @@ def _status(present: tuple[bool, bool], differ: bool) -> ComparisonStatus:
 
 
 def _noise(candidate: Candidate, p: float) -> ComparedNoise:
-    """Return a noise property as compared, at its adjusted p."""
+    """Compare a noise property of vehicle and simulator at its p corrected for multiple tests.
+
+    On one side only, but without a significant difference, or on neither side, it counts as alike.
+    """
     differ = p < LEVEL and candidate.matters
     status = _status(candidate.there, differ) if any(candidate.there) else ComparisonStatus.ALIKE
     if status is ComparisonStatus.CANNOT_TELL:

@@ -303,7 +303,7 @@ def _next_recording(file: BinaryIO, at: int, size: int) -> int | None:
 
 
 class _FileWalk:
-    """Walk through a file record by record."""
+    """Walk through a damaged MCAP file record by record."""
 
     def __init__(
         self, file: BinaryIO, size: int, tables: Tables, damage: Damage, indexes: Collection[ChunkIndex]

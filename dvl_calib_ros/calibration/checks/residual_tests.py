@@ -419,7 +419,7 @@ def _filtered_noise(noise: Array, step: float, seconds: float, late: float) -> A
 
 
 def _innovation_filter(values: Array) -> Array:
-    """Return coefficients (2 `NEIGHBOURS` + 1,) of a sample's prediction error by its neighbours, from values (N,)."""
+    """Return a filter (2 `NEIGHBOURS` + 1,) that gives a sample's error of interpolation from both sides."""
     around = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
     own, others = around[:, NEIGHBOURS], np.delete(around, NEIGHBOURS, axis=1)
     square = others.T @ others

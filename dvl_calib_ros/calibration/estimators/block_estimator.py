@@ -193,7 +193,10 @@ class FullEstimator(Estimator):
 
     @property
     def arm_effect(self) -> float | None:
-        """See `Estimator`: a mean turn adds as much to the mean error as turns add to the slow errors."""
+        """See `Estimator`. Without turn rates the lever arm's velocity appears as slow noise.
+
+        Its mean over a recording is taken to be as large as the slow variance beyond the prior.
+        """
         slow = None if self._idle_solver().has_imu else self.slow_noise
         if slow is None:
             return None

@@ -108,7 +108,7 @@ class BlockSolver:
     def suggestion(self, *, fresh: bool = True) -> Reason | None:
         """Return the configuration that fits the data, if the given one is grossly wrong.
 
-        fresh: use all data, which takes time; else the latest live registration.
+        fresh: register clocks and frames again from all blocks, which is slow; else use the latest registration.
         """
         if own := self._dvl_stream.contradiction():
             return own

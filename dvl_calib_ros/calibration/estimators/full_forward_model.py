@@ -84,10 +84,14 @@ class FitBlock:
 
     @cached_property
     def slope_variance(self) -> float:
-        """Variance ((m/s²)², per axis) of the differenced acceleration due to DVL noise alone."""
+        """Variance ((m/s²)², per axis) of the acceleration due to DVL noise alone.
+
+        The acceleration is the velocity difference over ±`slope_reach_s`.
+        """
         if len(self.dvl.times) < 6:
             return 0.0
-        fourth = np.diff(self.dvl.velocity, 4, axis=0) ** 2 / 70.0  # the variance, for white noise
+        # a fourth difference of white noise has 70 times its variance
+        fourth = np.diff(self.dvl.velocity, 4, axis=0) ** 2 / 70.0
         noise = float(np.sort(fourth, axis=0)[len(fourth) // 2].mean()) / MEDIAN_SQUARE
         return noise / (2.0 * self.slope_reach_s**2)
 

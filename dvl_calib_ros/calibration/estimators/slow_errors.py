@@ -110,9 +110,9 @@ def binned_rows(rows: PredictedRows, row_weight: Array, from_s: float, end_s: fl
 
 
 def scatter(bins: Bins) -> tuple[Array, Array]:
-    """Return the sum of squares (3,) of the residual about a line over the section, and its degrees of freedom (3,).
+    """Return the residual's sum of squares (3,) about a straight line in time, and its degrees of freedom (3,).
 
-    The line removes the slow errors.
+    A section lies between two knots of the slow errors; the line removes them.
     """
     squares, freedom = np.zeros(3), np.zeros(3)
     for axis in range(3):

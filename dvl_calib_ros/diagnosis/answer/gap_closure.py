@@ -184,9 +184,9 @@ def _drift(selection: EffectSelection, residuals: HeldOutResiduals) -> tuple[Dri
 def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residuals: HeldOutResiduals) -> Gap:
     """Return a gap with its closure, by the distribution of the true parameters about the estimated ones.
 
-    covariance: (6 + p, 6 + p) of the parameters. The noise-free error is the estimated effects' and the error's of
-    their parameters, both after a calibration. Equivalent effects are equally likely, and so are the effects of
-    `EffectSelection.wider`: slow noise explains these as well.
+    covariance: (6 + p, 6 + p) of the parameters, which are drawn around their estimates. The closure of a draw is one
+    minus residual over error in energy, without what a calibration absorbs. Equivalent hypotheses, and that of
+    `EffectSelection.wider`, which slow noise explains as well, get equal shares of the draws.
     """
     fit, fitter = selection.fit, selection.fitter
     if not fit.effects:
@@ -231,7 +231,10 @@ def remainder(selection: EffectSelection, residuals: HeldOutResiduals) -> float:
 
 
 def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tuple[float, float]]:
-    """Return RMS errors (m/s) before and after the effects by recording; empty for a single one."""
+    """Return each recording's held-out RMS error (m/s) before and after correcting the effects.
+
+    Empty for a single recording.
+    """
     if len(problem.recordings) == 1:
         return {}
     of_sample = problem.recording_of[problem.bin_of]

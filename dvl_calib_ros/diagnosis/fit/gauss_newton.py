@@ -80,7 +80,8 @@ class Fit:
     def gain_over(self, reduced: Fit) -> float:
         """Return the lower bound of the deviance gain over another fit.
 
-        Fits with different noise differ in deviance by a normal variable of this size under the null hypothesis.
+        The deviances of two fits whose simulated whitened noise differs by d differ by σ = 2 |d| under the null
+        hypothesis. Heavy tails of that noise reduce the gain further.
         """
         other = self.own_noise - reduced.own_noise
         bound = reduced.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
@@ -268,7 +269,7 @@ class Fitter:
         return corrected if corrected.is_definite else system
 
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
-        """Return the whitened contribution (S n,) of simulated velocity noise to a hypothesis' residual (M, A)."""
+        """Return the whitened contribution (S n,) of S simulations of velocity noise to a residual of n values."""
         white = [
             self._whiten(noise, perturbed.residual(perturbed.all_seen(hypothesis)) - residual)
             for perturbed in self.problem.perturbed

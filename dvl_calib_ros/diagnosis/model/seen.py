@@ -180,9 +180,9 @@ def trace_columns(effect: Effect, motion: EffectInput, values: Values) -> Array:
     return -np.stack(slopes, axis=2)
 
 
-def central_difference(spec: EffectParameter, values: Values, of: Callable[[Values], Array]) -> Array:
-    """Return d of / d parameter by central differences within its bounds."""
+def central_difference(spec: EffectParameter, values: Values, function: Callable[[Values], Array]) -> Array:
+    """Return the derivative of a function of the values by a parameter: central, one-sided at its bounds."""
     step = 0.05 * spec.typical
     low, high = max(values[spec.name] - step, spec.low), min(values[spec.name] + step, spec.high)
-    slope: Array = (of({**values, spec.name: high}) - of({**values, spec.name: low})) / (high - low)
-    return slope
+    at_low, at_high = (function({**values, spec.name: each}) for each in (low, high))
+    return np.asarray((at_high - at_low) / (high - low))
