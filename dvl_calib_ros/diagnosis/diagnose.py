@@ -54,11 +54,11 @@ VISIBLE_TIMES_TYPICAL = 3.0
 MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
 # Least share of the gap's energy, on held-out data, that effects must close to explain it
-MATERIAL = 0.2
+MIN_CLOSURE = 0.2
 # Least closure of an explanation; less is a part of one (issue 46)
-EXPLAINS = 0.8
+FULL_CLOSURE = 0.8
 # Least ratio of the unexplained error to the noise that is worth a mention, and no "no gap"
-WORTH_TELLING = 0.3
+REPORTED_LEFT_SHARE = 0.3
 
 
 def diagnose(
@@ -240,14 +240,14 @@ def _verdict(selection: EffectSelection, unexplained: Unexplained, gap: Gap, vis
         return DiagnosisVerdict.UNKNOWN
     if gap.fails_held_out:
         return DiagnosisVerdict.UNKNOWN
-    if selection.selected and gap.closure < MATERIAL:
+    if selection.selected and gap.closure < MIN_CLOSURE:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
         return DiagnosisVerdict.AMBIGUOUS if ambiguous else DiagnosisVerdict.KNOWN
     if visible_share < MIN_VISIBLE_SHARE:
         return DiagnosisVerdict.INSUFFICIENT_EXCITATION
-    is_left = gap.not_explained > WORTH_TELLING * gap.noise_floor
+    is_left = gap.not_explained > REPORTED_LEFT_SHARE * gap.noise_floor
     return DiagnosisVerdict.UNKNOWN if is_left else DiagnosisVerdict.NO_GAP
 
 
@@ -383,7 +383,7 @@ def _reasons(
     """Return the verdict and the unexplained error as reasons."""
     numbers = {
         "names": " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found),
-        "explained": "explained" if gap.closure >= EXPLAINS else f"partly ({100.0 * gap.closure:.0f} %) explained",
+        "explained": "explained" if gap.closure >= FULL_CLOSURE else f"partly ({100.0 * gap.closure:.0f} %) explained",
         "before": 1e3 * gap.before,
         "after": 1e3 * gap.after,
         "noise": 1e3 * gap.noise_floor,
@@ -391,7 +391,7 @@ def _reasons(
         "tested": n_tested,
     }
     is_unknown = verdict is DiagnosisVerdict.UNKNOWN
-    is_left = bool(found) and gap.not_explained > WORTH_TELLING * gap.noise_floor
+    is_left = bool(found) and gap.not_explained > REPORTED_LEFT_SHARE * gap.noise_floor
     code = "GAP_PARTLY_UNKNOWN" if is_unknown and found else CODES[verdict]
     reasons = [finding(code, **numbers)]
     if is_left:

@@ -17,7 +17,7 @@ from ...errors import InputError
 from ..fit.cross_validation import fitted_without, folds_of
 from ..model.hypothesis import Hypothesis, is_time_of_run
 from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, CLOCKS, TWO_CLOCKS
-from ..search.event_scan import KNOWN_TO_S
+from ..search.event_scan import TIME_TOLERANCE_S
 from .results import Diagnosis, FoundEffect, certain_sizes
 
 OFFSETS = {
@@ -119,7 +119,7 @@ def corrections(diagnosis: Diagnosis, recording: int | None = None) -> dict[str,
         sizes = certain_sizes(effect.name, parameters)
         begin_end = {name: value for name, (value, _, _) in parameters.items() if name in times}
         if effect.name == "water_lock":
-            if begin_end["from_s"] >= KNOWN_TO_S or np.isfinite(begin_end["to_s"]):
+            if begin_end["from_s"] >= TIME_TOLERANCE_S or np.isfinite(begin_end["to_s"]):
                 continue
             begin_end["from_s"] = 0.0
         if sizes and "again_seconds" not in parameters:  # one jump cannot correct two

@@ -11,7 +11,7 @@ from ...calibration.numerics.distributions import binomial_interval, binomial_sf
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.tests import holm
-from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, around
+from ..fit.gauss_newton import Z_INTERVAL, Fit, Fitter, around
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..model.claimed_noise import relative_std
 from ..model.forward_model import Problem
@@ -25,7 +25,7 @@ CHANCE_OF_REPEAT = 1e-3
 # Least ratio of actual to reported noise that is reported
 INFLATION = 1.2
 # Exponent below which reported covariances are invalid; the other stream's noise lowers it even if they are valid
-HALF = 0.5
+INVALID_EXPONENT = 0.5
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
         error = 0.5 * error
         if ratio > INFLATION:
             p = float(2.0 * normal_sf(np.log(ratio) / error))
-            low, high = float(ratio * np.exp(-OF_INTERVAL * error)), float(ratio * np.exp(OF_INTERVAL * error))
+            low, high = float(ratio * np.exp(-Z_INTERVAL * error)), float(ratio * np.exp(Z_INTERVAL * error))
             found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
     names, log_claims = log_reported(problem, fit.seen, fit.noise.rotation)
     even = innovations * fit.noise.level
@@ -174,5 +174,5 @@ def _reported_covariance(problem: Problem, fit: Fit, even: Array) -> NoiseFindin
     parameters, p_values = {}, []
     for name, value, std in zip(found.names, found.exponents.tolist(), found.stds.tolist(), strict=True):
         parameters[f"{name}_exponent"] = around(value, std)
-        p_values.append(2.0 * float(normal_sf(abs(value - (0.0 if value > HALF else 1.0)) / std)))
+        p_values.append(2.0 * float(normal_sf(abs(value - (0.0 if value > INVALID_EXPONENT else 1.0)) / std)))
     return NoiseFinding("reported_covariance", parameters, float(min(1.0, len(p_values) * min(p_values))))

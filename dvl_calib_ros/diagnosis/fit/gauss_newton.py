@@ -21,22 +21,22 @@ from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 
 # Largest number of steps; converged if a step would reduce the deviance by less than this; differences of 1 matter
-MAX_STEPS, GAINS_NOTHING = 30, 1e-3
+MAX_STEPS, CONVERGED_GAIN = 30, 1e-3
 HALVINGS = 5
 # The last step is rejected if it increases the misfit by this factor
-ASTRAY = 30.0
+MAX_MISFIT_INCREASE = 30.0
 # Standard deviations of the chance gain from other noise that are subtracted
 CHANCE_GAIN_Z = 1.5
 # Prior σ of an effect's parameters, in typical sizes: wide, to act only on unobservable parameters
 PRIOR_IN_TYPICAL = 50.0
 # Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
-SURELY, BENT = 2.0, 0.2
+SKIP_MARGIN, NONLINEAR_SHARE = 2.0, 0.2
 # A burst: outliers with neighbours beyond half of that, of at most this share of the recording
-RARE = 0.02
+MAX_BURST_SHARE = 0.02
 # Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2)
-OF_A_TIME = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
+CHANGE_POINT_DEVIANCE = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 # Half width, in standard deviations, of a 95 per cent interval
-OF_INTERVAL = 1.96
+Z_INTERVAL = 1.96
 Mask = NDArray[np.bool_]
 # Evaluation of a hypothesis, and its residual (M, A)
 Evaluated = tuple[tuple[Seen, ...], Array]
@@ -44,7 +44,7 @@ Evaluated = tuple[tuple[Seen, ...], Array]
 
 def around(value: float, std: float) -> tuple[float, float, float]:
     """Return a value with its 95 per cent interval."""
-    return value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
+    return value, value - Z_INTERVAL * std, value + Z_INTERVAL * std
 
 
 def prior_std(hypothesis: Hypothesis) -> Array:
@@ -155,7 +155,7 @@ class Fitter:
         size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
         run = np.cumsum(np.diff(size > 0.5 * SETTINGS.outlying, prepend=False))  # odd in the runs, even between them
         in_burst = np.isin(run, run[size > SETTINGS.outlying])
-        return in_burst & (np.count_nonzero(in_burst) <= RARE * len(in_burst))
+        return in_burst & (np.count_nonzero(in_burst) <= MAX_BURST_SHARE * len(in_burst))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
         """Evaluate a hypothesis; return the evaluation and the residual (M, A)."""
@@ -214,7 +214,7 @@ class Fitter:
             free = np.flatnonzero(~is_fixed)
             step = np.zeros(len(is_fixed))
             step[free] = system.part(free).solution() if len(free) else 0.0
-            if misfit - system.misfit(step) < GAINS_NOTHING:
+            if misfit - system.misfit(step) < CONVERGED_GAIN:
                 break
             improved, trial_step = False, step
             for _ in range(HALVINGS):
@@ -240,7 +240,7 @@ class Fitter:
             last = hypothesis.moved(step)
             last_seen, last_residual = self.evaluated(last)
             last_misfit = self._misfit(noise, last_residual, last)
-            if last_misfit < ASTRAY * misfit:
+            if last_misfit < MAX_MISFIT_INCREASE * misfit:
                 hypothesis, seen, residual, misfit = last, last_seen, last_residual, last_misfit
                 made = partial(self.problem.all_columns, hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
@@ -358,10 +358,10 @@ class Fitter:
         minimum = linearised.system.misfit(linearised.system.solution())
         gain = self._misfit(noise, linearised.residual, hypothesis) - minimum
         minimum -= float(own_noise @ own_noise)
-        if minimum > deviance + SURELY + BENT * gain:
+        if minimum > deviance + SKIP_MARGIN + NONLINEAR_SHARE * gain:
             return True
         unattainable = min(promised, gain)
-        return minimum + unattainable > deviance + 2.0 * SURELY + BENT * (gain - unattainable)
+        return minimum + unattainable > deviance + 2.0 * SKIP_MARGIN + NONLINEAR_SHARE * (gain - unattainable)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """Return the time at which an effect begins or ends, with its 95 per cent interval."""
@@ -374,11 +374,11 @@ class Fitter:
             step, end, was_as_good = 0.5 * self.problem.interval, value, True
             while 0.0 <= (at := value + sign * step) <= seconds:
                 worse = self._worse_at(_with_time(fit, effect, name, recording, at), fit)
-                if was_as_good or worse < OF_A_TIME:  # the first rejected time bounds the interval
+                if was_as_good or worse < CHANGE_POINT_DEVIANCE:  # the first rejected time bounds the interval
                     end = at
                 if worse > SETTINGS.conclusive:
                     break
-                step, was_as_good = 1.6 * step, worse < OF_A_TIME
+                step, was_as_good = 1.6 * step, worse < CHANGE_POINT_DEVIANCE
             ends.append(end)
         return value, ends[0], ends[1]
 
@@ -395,7 +395,7 @@ class Fitter:
         for at in ends:
             if np.isfinite(at) and at != fit.values[effect.name][recording][name]:
                 moved = self.fit(_with_time(fit, effect, name, recording, at), fit.noise, 3).hypothesis.vector()
-                moved = (moved - fit.hypothesis.vector()) / OF_INTERVAL
+                moved = (moved - fit.hypothesis.vector()) / Z_INTERVAL
                 added += np.outer(moved, moved) / len(ends)
         return added
 

@@ -24,7 +24,7 @@ from .gauss_newton import Fit, Fitter, n_amplitudes, prior_std
 # Parts of the run at whose ends intermittent effects may begin or end
 WINDOW_STEPS = 10
 # Deviance within which the more usual effects are preferred
-AS_WELL = 2.0
+EQUAL_DEVIANCE = 2.0
 # Time constant, s, of the slowest noise as an alternative to an effect: GNSS multipath lasts minutes
 SLOWEST_S = 100.0
 # Simulated residuals of slow noise
@@ -68,7 +68,7 @@ def best_of(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
     """
     scores = [criterion(fit, len(effects)) for fit in fits]
     rank = {name: index for index, name in enumerate(effects)}
-    equivalent = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + AS_WELL]
+    equivalent = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + EQUAL_DEVIANCE]
     return min(equivalent, key=lambda fit: (sum(rank[effect.name] for effect in fit.effects), fit.deviance))
 
 

@@ -18,11 +18,11 @@ from ...calibration.numerics.frames import Array
 from .settings import SETTINGS
 
 # Largest exponent: if standard deviations are written as variances, the reported values are square roots
-LARGEST = 2.0
+MAX_EXPONENT = 2.0
 # Least standard deviation of the logarithm of reported values that is informative
-DIFFER = 0.05
+MIN_LOG_STD = 0.05
 # Bound of the log noise level about its mean
-FARTHEST = 4.0
+MAX_LOG_LEVEL = 4.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Exponents:
 
 def is_informative(log_claims: Array) -> bool:
     """Return whether reported values (M, A) are informative."""
-    return bool(np.max(np.std(log_claims, axis=0), initial=0.0) > DIFFER)
+    return bool(np.max(np.std(log_claims, axis=0), initial=0.0) > MIN_LOG_STD)
 
 
 def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: NDArray[np.intp]) -> Exponents:
@@ -73,8 +73,8 @@ def relative_std(log_claims: Array, values: Array, names: Sequence[str], stretch
     while kept:
         found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
         if found.is_significant.all():
-            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, LARGEST)
-            return np.asarray(np.exp(np.clip(logarithm, -FARTHEST, FARTHEST)))
+            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, MAX_EXPONENT)
+            return np.asarray(np.exp(np.clip(logarithm, -MAX_LOG_LEVEL, MAX_LOG_LEVEL)))
         kept.pop(int(np.argmin(found.exponents / found.stds)))
     return np.ones(values.shape)
 
@@ -102,4 +102,4 @@ def relative_noise(time: Array, sample_std: Array | None, differences: Array, we
     if not found.is_significant.all():
         return np.ones(shape)
     median = np.median(sample_std, axis=0)
-    return np.asarray((sample_std / median) ** min(float(found.exponents[0]), LARGEST))
+    return np.asarray((sample_std / median) ** min(float(found.exponents[0]), MAX_EXPONENT))

@@ -33,18 +33,18 @@ from ...verdict.reasons import Reason
 from .settings import SETTINGS
 from .stream_curve import Curve
 
-# A stream is stamped twice where two steps span less than this many usual steps, at least FEWEST times in a row
-TWO_STEPS, FEWEST = 1.25, 4
+# A stream is stamped twice where two steps span less than this many usual steps, at least MIN_IN_A_ROW times in a row
+STAMPED_TWICE_STEPS, MIN_IN_A_ROW = 1.25, 4
 # Sorted by stamp, such samples alternate between two times: second differences exceed the usual ones by this factor.
 # Otherwise the mixture does no harm.
-TO_AND_FRO = 2.0
-# Irregular steps indicate a clock if there are at most RARE. Irregular: by FAR times the scatter of steps, within these
-# relative bounds
-RARE, REGULAR, FAR = 3, (0.03, 0.1), 8.0
+ALTERNATING_FACTOR = 2.0
+# At most this number of irregular steps indicates a clock. Irregular: by IRREGULAR_Z times the scatter of steps, within
+# these relative bounds
+MAX_IRREGULAR, IRREGULAR_BOUNDS, IRREGULAR_Z = 3, (0.03, 0.1), 8.0
 # Of two samples closer than this share of the usual step, one is removed: an interpolating curve would ring
-TOO_SHORT = 0.5
+MIN_STEP_SHARE = 0.5
 # Largest backward steps, s: if the stamps do not show the size, and if they do
-UP_TO_S, LONGEST_S = 2.0, 5.0
+MAX_BACK_S, MAX_SHOWN_BACK_S = 2.0, 5.0
 
 
 class BackwardStep(NamedTuple):
@@ -63,25 +63,25 @@ def backward_steps(time: Array, velocity: Array) -> tuple[tuple[BackwardStep, ..
     one sample is kept. A DVL that pings faster for a while has short steps for longer, and a smooth velocity.
     """
     is_unique = np.ones(len(time), dtype=bool)
-    if len(time) < 4 * FEWEST:
+    if len(time) < 4 * MIN_IN_A_ROW:
         return (), is_unique
     steps = np.diff(time)
     interval = float(np.median(steps))
-    crowded = time[2:] - time[:-2] < TWO_STEPS * interval
+    crowded = time[2:] - time[:-2] < STAMPED_TWICE_STEPS * interval
     bending = np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
     events = []
     for first, end in np.flatnonzero(np.diff(np.pad(crowded, 1).astype(int))).reshape(-1, 2).tolist():
         duration = float(time[end + 1] - time[first])
-        is_mixed = np.median(bending[first:end]) > TO_AND_FRO * np.median(bending)
-        if end - first >= FEWEST and duration < LONGEST_S and is_mixed:
+        is_mixed = np.median(bending[first:end]) > ALTERNATING_FACTOR * np.median(bending)
+        if end - first >= MIN_IN_A_ROW and duration < MAX_SHOWN_BACK_S and is_mixed:
             is_unique[first : end + 2] = False
             events.append(BackwardStep(float(time[first]), float(time[end + 1]), duration))
     relative = np.abs(steps - interval) / interval
-    odd = np.flatnonzero(relative > np.clip(FAR * np.median(relative), *REGULAR))
+    odd = np.flatnonzero(relative > np.clip(IRREGULAR_Z * np.median(relative), *IRREGULAR_BOUNDS))
     short = odd[steps[odd] < interval]
-    if not events and len(short) > 0 and len(odd) <= RARE:
-        events = [BackwardStep(float(time[index]), float(time[index + 1]), UP_TO_S) for index in short.tolist()]
-        is_unique[short[steps[short] < TOO_SHORT * interval] + 1] = False
+    if not events and len(short) > 0 and len(odd) <= MAX_IRREGULAR:
+        events = [BackwardStep(float(time[index]), float(time[index + 1]), MAX_BACK_S) for index in short.tolist()]
+        is_unique[short[steps[short] < MIN_STEP_SHARE * interval] + 1] = False
     return tuple(events), is_unique
 
 

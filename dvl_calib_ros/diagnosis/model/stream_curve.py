@@ -23,14 +23,14 @@ from .settings import SETTINGS
 # Fewest samples for a spectrum that separates motion from noise; number of bands whose power is averaged
 MIN_SPECTRUM, BANDS = 60, 40
 # Ratios of a band's power to noise up to which it is removed as noise, and from which it is kept
-NOISE_ALONE, SOME_MOTION = 1.4, 2.5
+NOISE_POWER_RATIO, MOTION_POWER_RATIO = 1.4, 2.5
 # Weights of fourth differences
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Longest interval, s, of a stream that resolves turns and waves: only its noise is removed; samples per smoothing cubic
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
 # Relative excess of tails that is significant (3 σ): the median of
 # neighbours' differences has a relative σ of 1.6 / √n
-SURELY_HEAVY = 3.0 * 1.6
+HEAVY_TAIL_Z = 3.0 * 1.6
 # Largest product of the intervals to both neighbours, in usual intervals; at the middle of two samples it is 0.25
 MAX_NEIGHBOUR_PRODUCT = 0.4
 
@@ -144,7 +144,7 @@ class Curve:
         if not len(std):
             return 1.0
         clipped = np.sqrt(np.mean((np.clip(deviation / std, -SETTINGS.outlying, SETTINGS.outlying)) ** 2))
-        return float(np.maximum(clipped / (1.0 + SURELY_HEAVY / np.sqrt(deviation.size)), 1.0) ** 2)
+        return float(np.maximum(clipped / (1.0 + HEAVY_TAIL_Z / np.sqrt(deviation.size)), 1.0) ** 2)
 
     @cached_property
     def relative_noise(self) -> Array:
@@ -244,7 +244,7 @@ def _gain(power: Array, noise: float) -> Array:
     n = len(power)
     edges = np.unique(np.concatenate([[0], np.geomspace(1.0, n, BANDS), [n]]).astype(int))
     mean = np.add.reduceat(power, edges[:-1]) / np.diff(edges)
-    over = np.clip((mean / max(noise, 1e-300) - NOISE_ALONE) / (SOME_MOTION - NOISE_ALONE), 0.0, 1.0)
+    over = np.clip((mean / max(noise, 1e-300) - NOISE_POWER_RATIO) / (MOTION_POWER_RATIO - NOISE_POWER_RATIO), 0.0, 1.0)
     return np.repeat(np.maximum(over, neighbours(over)), np.diff(edges))
 
 

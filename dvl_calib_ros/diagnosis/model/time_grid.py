@@ -19,7 +19,7 @@ from .stream_curve import FAST_ENOUGH_S
 PAUSE_S = 60.0
 # Interval, s, of the motion that a filter follows if the grid is slower than `FAST_ENOUGH_S`: from slopes at 1 Hz, a
 # wave of 5 s is a quarter too small
-CLOSE_S = 0.1
+MOTION_INTERVAL_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Grid:
             return None
         steps = np.diff(time)
         interval = float(np.median(steps))
-        parts = min(int(np.ceil(interval / CLOSE_S)), SETTINGS.max_points // len(time))
+        parts = min(int(np.ceil(interval / MOTION_INTERVAL_S)), SETTINGS.max_points // len(time))
         if interval <= FAST_ENOUGH_S or parts < 2:
             return None
         of_each = np.where(steps < SETTINGS.max_gap_intervals * interval, parts, 1)

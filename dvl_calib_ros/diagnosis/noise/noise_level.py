@@ -18,7 +18,7 @@ from ..model.settings import SETTINGS
 from .noise_model import Noise, white_noise
 
 # Extreme rows that alone do not establish a level
-FEW = 6
+N_EXTREMES = 6
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ def _fit_slopes(found: Sequence[Array], log_square: Array) -> tuple[Array, Array
 
 
 def _clip_extremes(values: Array) -> Array:
-    """Clip values (M,) to the range without `FEW` extreme rows: an accidentally small one biases a slope."""
+    """Clip values (M,) to the range without `N_EXTREMES` extreme rows: an accidentally small one biases a slope."""
     ordered = np.sort(values)
-    few = min(FEW, (len(values) - 1) // 2)
+    few = min(N_EXTREMES, (len(values) - 1) // 2)
     return np.clip(values, ordered[few], ordered[-1 - few])
 
 

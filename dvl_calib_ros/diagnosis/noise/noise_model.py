@@ -24,7 +24,7 @@ HUBER = 2.5
 # Passes of winsorising: an outlier is in its neighbours' predictions until it is corrected
 WINSORISED_TIMES = 3
 # Least share of a good fit's innovations within that; of Student's t with 3 degrees of freedom 0.93
-MOST_NEAR = 0.5
+MIN_NEAR_SHARE = 0.5
 # Time constant, s, of the slowest receiver noise; intermittent effects are slower
 LONGEST_S = 15.0
 ORDERS = ((0, 0), (1, 0), (1, 1))
@@ -33,9 +33,9 @@ MAX_FREQUENCIES = 300
 # Points per coefficient of an ARMA's posterior, and largest inverse hyperbolic tangent of a moving average
 POSTERIOR_POINTS, MA_REACH = 40, 2.5
 # Upper bound of the share of noise at a frequency that a fit absorbs
-MOST_TAKEN = 0.99
+MAX_ABSORBED_SHARE = 0.99
 # Share of a whitened value that is rounding
-FADED = 1e-12
+ROUNDED_TO = 1e-12
 # m/s; below any instrument's resolution: streams equal to rounding would otherwise have no noise
 LEAST_MPS = 1e-6
 Integers = NDArray[np.intp]
@@ -190,13 +190,13 @@ class Noise:
         parts = waves.view(float)
         power = np.einsum("map,map->am", parts, parts) / m
         half = np.arange(m // 2 + 1)
-        return np.clip(0.5 * (power[:, half] + power[:, -half]), 0.0, MOST_TAKEN)
+        return np.clip(0.5 * (power[:, half] + power[:, -half]), 0.0, MAX_ABSORBED_SHARE)
 
     @property
     def memory_samples(self) -> int:
-        """Return the number of samples in which whitened values fade to `FADED` after the last that is not zero."""
+        """Return the number of samples in which whitened values fade to `ROUNDED_TO` after the last nonzero one."""
         largest = max(abs(arma.ma) for arma in self.axes)
-        return 1 + (int(np.log(FADED) / np.log(largest)) if largest else 0)
+        return 1 + (int(np.log(ROUNDED_TO) / np.log(largest)) if largest else 0)
 
     @property
     def is_coloured(self) -> bool:
@@ -281,8 +281,8 @@ class Noise:
             scale = robust_std(deviation)
             share_within = np.mean(np.abs(deviation) < HUBER * scale, axis=0)
             beyond = deviation - np.clip(deviation, -HUBER * scale, HUBER * scale)
-        pseudo = (scaled - beyond * stds) / np.maximum(share_within, MOST_NEAR)
-        return self._unscaled(np.where(share_within > MOST_NEAR, pseudo, scaled))
+        pseudo = (scaled - beyond * stds) / np.maximum(share_within, MIN_NEAR_SHARE)
+        return self._unscaled(np.where(share_within > MIN_NEAR_SHARE, pseudo, scaled))
 
 
 def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None, interval: float = 1.0) -> Noise:

@@ -11,7 +11,7 @@ from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array, product
 
 # Share of noise in a direction's squares from which the direction is excluded
-MOSTLY = 0.5
+MAX_NOISE_SHARE = 0.5
 # Added to normal equations of unit diagonal, so that collinear columns have a solution
 ROUNDING = 1e-9
 # Directions with less than this share of their length outside the others are excluded as collinear
@@ -69,7 +69,7 @@ class WhitenedLeastSquares:
         root = root_of_inverse(self._normal)
         shares, along = np.linalg.eigh(root @ noise[:-1, :-1] @ root.T)
         right = along.T @ root @ (self.gram[:-1, -1] - noise[:-1, -1] + self.centre / self.std**2)
-        signal = np.where(shares < MOSTLY, right / np.maximum(1.0 - shares, 1.0 - MOSTLY), 0.0)
+        signal = np.where(shares < MAX_NOISE_SHARE, right / np.maximum(1.0 - shares, 1.0 - MAX_NOISE_SHARE), 0.0)
         return np.asarray(root.T @ along @ signal)
 
     def squares(self, x: Array) -> float:

@@ -26,13 +26,13 @@ from .arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY
 from .clock_jumps import LEAP
 
 # Variants to combine; proposals fitted per round
-SHORTLIST, FITTED = 12, 7
+SHORTLIST, N_PROPOSALS = 12, 7
 # Places for the largest gains on top of the fit: next to seconds of clock offset a drift adds little
-ADDING_MOST = 4
+N_LARGEST_GAINS = 4
 # Start times kept per intermittent effect
 KEPT_VARIANTS = 2
 # Share of the coloured noise's misfit that an intermittent effect may leave
-MOST_OF_NOISE = 0.5
+MAX_LEFT_MISFIT_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
     fit = replace(fit, noise=fit.noise.white)
     table, to_fit = _combinations(fitter, fit, effects)
     own = len(fit.effects)
-    limit = MOST_OF_NOISE * table.misfit(range(own))
+    limit = MAX_LEFT_MISFIT_SHARE * table.misfit(range(own))
     come = [
         chosen
         for chosen in to_fit
@@ -127,7 +127,7 @@ def _combinations(
     scored.sort()
     scored = [each for each in scored if _has_no_redundant_clock(table, each[1])]
     to_fit = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + SETTINGS.conclusive))[
-        :FITTED
+        :N_PROPOSALS
     ]
     if not any(_is_possible(table, chosen) for chosen in to_fit):  # outside the linear range
         to_fit += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
@@ -217,7 +217,7 @@ def _shortlisted(table: LinearisedModel, present: Sequence[int], cost: Sequence[
     kept: list[int] = []
     of_effect: dict[str, int] = {}
     by_addition = sorted((i for i in adds if adds[i] > 0.0), key=lambda i: -adds[i])
-    for limit, ranked in ((ADDING_MOST, by_addition), (SHORTLIST, sorted(gains, key=lambda i: -gains[i]))):
+    for limit, ranked in ((N_LARGEST_GAINS, by_addition), (SHORTLIST, sorted(gains, key=lambda i: -gains[i]))):
         for index in ranked:
             name = table.variants[index].effect.name
             if index not in kept and of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < limit:

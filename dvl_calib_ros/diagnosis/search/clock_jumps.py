@@ -14,7 +14,7 @@ import numpy as np
 
 from ...calibration.numerics.frames import Array
 from ...effects.base import ActsOn, Effect, late
-from ..fit.gauss_newton import OF_A_TIME, Fit, Fitter
+from ..fit.gauss_newton import CHANGE_POINT_DEVIANCE, Fit, Fitter
 from ..fit.selection_criteria import step_of_times
 from ..model.hypothesis import Hypothesis, Values
 from ..model.settings import SETTINGS
@@ -28,12 +28,12 @@ STANDS_IN = (DVL_CLOCK, *MOVING_CLOCK)
 # DVL delays to try, s; parts of a run with constant delay, and fewest parts between jumps: shorter ones are not
 # identifiable from the ends of a run
 DELAYS = np.arange(-4.0, 4.01, 0.25)
-PARTS, FEWEST_PARTS = 60, 3
+N_PARTS, FEWEST_PARTS = 60, 3
 # Largest gaps that may be jumps ahead: their number, least length (s), which is a least delay too, and tolerance of the
 # size of a jump (s)
-GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
+N_GAPS, MIN_GAP_S, SIZE_TOL_S = 6, 0.15, 0.3
 # Lost samples leave a gap of whole steps; a clock jump differs from that by this share of a step
-OF_A_STEP = 0.15
+STEP_TOLERANCE = 0.15
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     back = [(event.before, -event.by) for event in recording.backward_steps]
     for event in recording.backward_steps:
         steps[(stamps[:-1] <= event.before) & (stamps[1:] >= event.after)] = interval
-    largest = np.argsort(-steps)[:GAPS]
+    largest = np.argsort(-steps)[:N_GAPS]
     ahead = zip(stamps[largest].tolist(), (steps[largest] - interval).tolist(), strict=True)
     injections = [each for each in fit.hypothesis.injections(0) if each.effect.name != LEAP]
     jumps: list[tuple[float, float]] = []  # stamps (s) of the jumps, and sizes (s)
@@ -99,19 +99,19 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
         other_jumps = [each for each in jumps if each != its]
         before = sum(by for at, by in other_jumps if at < stamp)
         at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * interval
-        if abs(gap) > GAP_FROM_S and at > 0.0:
+        if abs(gap) > MIN_GAP_S and at > 0.0:
             result.append((at, gap))
     return result
 
 
 def _is_shifted(gap: float, interval: float) -> bool:
     """Return whether a gap is a clock jump: negative or not a whole number of steps, unlike lost samples."""
-    return gap < 0.0 or OF_A_STEP < (gap / interval) % 1.0 < 1.0 - OF_A_STEP
+    return gap < 0.0 or STEP_TOLERANCE < (gap / interval) % 1.0 < 1.0 - STEP_TOLERANCE
 
 
 def _is_as_large(by: float, gap: float) -> bool:
     """Return whether a jump (s) matches a gap (s); a backward step may be smaller than the gap."""
-    return gap - AS_LARGE_S < by < (0.0 if gap < 0.0 else gap + AS_LARGE_S)
+    return gap - SIZE_TOL_S < by < (0.0 if gap < 0.0 else gap + SIZE_TOL_S)
 
 
 def with_jumps_in_gaps(fitter: Fitter, fit: Fit) -> Fit:
@@ -134,7 +134,7 @@ def with_jumps_in_gaps(fitter: Fitter, fit: Fit) -> Fit:
             fair = replace(fitter, outliers=np.where(excluded[:, None], 0.0, fitter.outliers), _fits={})
             refitted = [fair.fit(each, fit.noise) for each in (fit.hypothesis, trial)]
             before, after = (float((each.noise.whiten(each.residual) ** 2).sum()) for each in refitted)
-            if after < before + OF_A_TIME:
+            if after < before + CHANGE_POINT_DEVIANCE:
                 fit = fitter.fit(refitted[1].hypothesis, fit.noise)
     return fit
 
@@ -148,7 +148,7 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
     interval = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
     value, size = fit.values[LEAP][0][at_s], fit.values[LEAP][0][at_s.replace("at_s", "seconds")]
     for time, gap in gaps(fitter, fit):
-        if _is_shifted(gap, interval) and _is_as_large(size, gap) and abs(value - time) < max(interval, AS_LARGE_S):
+        if _is_shifted(gap, interval) and _is_as_large(size, gap) and abs(value - time) < max(interval, SIZE_TOL_S):
             return value, min(value, time) - interval, max(value, time) + interval
     return None
 
@@ -161,7 +161,7 @@ def _hypotheses(
     if ARM in single and ARM not in {effect.name for effect in essential}:
         essential.append(single[ARM])
     hypotheses: dict[frozenset[str], Hypothesis] = {}
-    clocks = [{}, {DVL_CLOCK: before}] if abs(before) > GAP_FROM_S and DVL_CLOCK in single else [{}]
+    clocks = [{}, {DVL_CLOCK: before}] if abs(before) > MIN_GAP_S and DVL_CLOCK in single else [{}]
     lags = [{}, *lags_and_delays(fit, single)]
     for included, lag, clock in itertools.product((list(kept), essential), lags, clocks):
         if lag:
@@ -178,8 +178,8 @@ def _hypotheses(
 def _squares(fitter: Fitter, fit: Fit, kept: Sequence[Effect], clock: Effect) -> tuple[Array, Array]:
     """Return whitened squares (D, P) per delay and part of the run, and the last bins (P,) of the parts."""
     white = fit.noise.white
-    ends = np.linspace(0, len(fit.residual), PARTS + 1).astype(int)
-    squares = np.zeros((len(DELAYS), PARTS))
+    ends = np.linspace(0, len(fit.residual), N_PARTS + 1).astype(int)
+    squares = np.zeros((len(DELAYS), N_PARTS))
     for number, seconds in enumerate(DELAYS.tolist()):
         trial = fit.hypothesis.with_effects([*kept, clock], 1, {clock.name: ({"seconds": seconds},)})
         whitened = white.whiten(fitter.evaluated(trial)[1]).reshape(len(fit.residual), -1)

@@ -326,11 +326,11 @@ def _with_heading_instead(fit: Fit, names: Collection[str], heading: Effect) -> 
 
 
 # Robust standard deviations from the other stream; an outlier exceeds these and `SETTINGS.outlying` from its neighbours
-FROM_OTHER = 4.0
+OTHER_STREAM_Z = 4.0
 # Bounds of the ratio of both deviations, projected: around a turn between samples they differ more
-ALIKE = (0.6, 1.7)
+DEVIATION_RATIO = (0.6, 1.7)
 # Fewest samples for a scatter
-FEWEST = 30
+MIN_SCATTER_SAMPLES = 30
 
 
 def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
@@ -367,7 +367,7 @@ def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn
     of_dvl = clock is ActsOn.DVL_CLOCK
     curve, other = (recording.dvl, recording.reference) if of_dvl else (recording.reference, recording.dvl)
     kept = np.ones(len(curve.time), dtype=bool)
-    if curve.interval <= FAST_ENOUGH_S or len(curve.time) < FEWEST:
+    if curve.interval <= FAST_ENOUGH_S or len(curve.time) < MIN_SCATTER_SAMPLES:
         return kept
     injections = hypothesis.injections(index)
     true = true_times(injections, clock, curve.time)
@@ -375,9 +375,9 @@ def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn
     measured = np.array(problem.measured)
     error = (seen.error if of_dvl else -seen.error) * measured
     suspicious = other.covers(seen.reference_stamps if of_dvl else seen.dvl_stamps)
-    suspicious &= np.abs(error / _scatter(error)).max(axis=1) > FROM_OTHER
+    suspicious &= np.abs(error / _scatter(error)).max(axis=1) > OTHER_STREAM_Z
     others = curve.part(~suspicious)  # adjacent outliers would confirm each other
-    if not suspicious.any() or len(others.time) < FEWEST:
+    if not suspicious.any() or len(others.time) < MIN_SCATTER_SAMPLES:
         return kept
 
     def in_body(values: Array) -> Array:
@@ -392,7 +392,7 @@ def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn
     dev = in_body((curve.values - others(curve.time)) / curve.relative_noise)
     gain = (dev * error).sum(axis=1) / np.maximum((dev**2).sum(axis=1), 1e-300) / curve.relative_noise.mean(axis=1)
     bad = suspicious & others.covers(curve.time) & (np.abs(dev / scatter).max(axis=1) > SETTINGS.outlying)
-    bad &= (gain > ALIKE[0]) & (gain < ALIKE[1])
+    bad &= (gain > DEVIATION_RATIO[0]) & (gain < DEVIATION_RATIO[1])
     return ~bad
 
 

@@ -22,7 +22,7 @@ from ..noise.whitened_least_squares import ScoreTest
 # events whitened together, whose columns share one Gram matrix
 TIMES, BATCH = 150, 10
 # A time of the run is known to this, s: clocks and gaps move it
-KNOWN_TO_S = 4.0
+TIME_TOLERANCE_S = 4.0
 # Half widths of triangular pulses, s
 HALF_WIDTHS_S = (8.0, 24.0, 72.0)
 
@@ -76,7 +76,7 @@ def _near_fitted_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     for effect in fit.effects:
         for rows, values in zip(problem.rows_of, fit.values[effect.name], strict=True):
             for spec in filter(is_time_of_run, effect.parameters):
-                excluded[rows] |= np.abs(problem.time[rows] - values[spec.name]) < KNOWN_TO_S
+                excluded[rows] |= np.abs(problem.time[rows] - values[spec.name]) < TIME_TOLERANCE_S
     return excluded
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...calibration.registration.registration import IN_TIME_STD_S
 from ...effects.base import Effect
 from ..fit.cross_validation import predictive_gain_of
-from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, n_amplitudes
+from ..fit.gauss_newton import Z_INTERVAL, Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import (
     blocks_of,
     fit_without,
@@ -149,7 +149,7 @@ def _clock_or_arm(
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
     delays = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
-    is_late = trade_off is None or max(delays, default=0.0) >= OF_INTERVAL * trade_off.delay_std_s
+    is_late = trade_off is None or max(delays, default=0.0) >= Z_INTERVAL * trade_off.delay_std_s
 
     def passes(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:

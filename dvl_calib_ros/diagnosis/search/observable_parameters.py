@@ -8,7 +8,7 @@ import numpy as np
 
 from ...calibration.numerics.frames import Array
 from ...effects.base import Effect
-from ..fit.gauss_newton import OF_INTERVAL, Fit
+from ..fit.gauss_newton import Z_INTERVAL, Fit
 from ..model.forward_model import Problem
 from ..model.hypothesis import Values, amplitudes, is_time_of_run, no_effect
 from ..model.seen import Seen
@@ -17,7 +17,7 @@ from .arm_clock_ambiguity import ARM
 # A parameter of typical size is excluded if its column is below this share of its effect's largest, or of a usual bias
 # (m/s): model errors are as large. A boat that rolls at 0.2°/s does not make the DVL's height observable, an AUV at
 # 1°/s does. A level vehicle makes neither the upward bias nor roll and pitch of the mounting observable.
-SHOWN_FROM, USUAL_MPS = 0.2, 0.02
+MIN_SHARE, USUAL_BIAS_MPS = 0.2, 0.02
 # A part of the lever arm is kept if this length (m) is observable: metres left out would rotate the rest. An AUV that
 # rolls at 0.5°/s is such a case.
 ARM_FROM_M = 0.6
@@ -44,18 +44,18 @@ def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> 
     squares = (columns**2).sum(axis=1).mean(axis=0)
     of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of recordings the most informative
     sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
-    threshold = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
+    threshold = MIN_SHARE * min(float(sizes.max()), USUAL_BIAS_MPS)
     out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < threshold}
     if effect.name == ARM:
         by_metre = zip(specs, np.sqrt(of_each).tolist(), strict=True)
-        out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < SHOWN_FROM * USUAL_MPS}
+        out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < MIN_SHARE * USUAL_BIAS_MPS}
     return effect.without(out)
 
 
 def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
     """Return the lever arm effect without components below 2 σ of the model error, None if all are significant."""
     known = _model_error(problem, fit)
-    faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < OF_INTERVAL * std}
+    faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < Z_INTERVAL * std}
     (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)
     return arm and arm.without(faint)
 
@@ -79,8 +79,8 @@ def _model_error(problem: Problem, fit: Fit) -> dict[str, float]:
         for each, size in zip(fit.hypothesis.parameters(), sizes, strict=True)
         if each.effect.name == ARM
     ]
-    threshold = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
-    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < threshold}
+    threshold = MIN_SHARE * min(max(size * spec.typical for spec, size in own), USUAL_BIAS_MPS)
+    return {spec.name: MIN_SHARE * USUAL_BIAS_MPS / size for spec, size in own if size * spec.typical < threshold}
 
 
 def default_values(effect: Effect, problem: Problem) -> list[Values]:

@@ -37,12 +37,12 @@ STEPS_OF_A_BIN = 16
 # Degrees of freedom of the prior on the null distribution's scale of 1
 PRIOR_DOF = 4.0
 # Share of the effects' explained deviance that inexact interpolation may leave
-INEXACT = 0.005
+INTERPOLATION_SHARE = 0.005
 # Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
 # fifteen functions of the turn rate.
-AS_LIKELY = 6.0
+EQUAL_LOG_P = 6.0
 # A column belongs to a group whose functions leave less than this share of its squares
-OF_GROUP = 0.02
+GROUP_RESIDUAL_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     found_events = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
     if found_events:  # slow noise explains a step as well, unless the step predicts better
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
-        least = INEXACT * (base.deviance - fit.deviance)
+        least = INTERPOLATION_SHARE * (base.deviance - fit.deviance)
         found_events = [
             each
             for each in found_events
@@ -129,8 +129,8 @@ def _limit(tested: int, columns: int) -> float:
 
 
 def _simplest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
-    """Return the candidate with the fewest columns among those within `AS_LIKELY` of log_p."""
-    likely = (each for each in tests if each[0] <= log_p + AS_LIKELY)
+    """Return the candidate with the fewest columns among those within `EQUAL_LOG_P` of log_p."""
+    likely = (each for each in tests if each[0] <= log_p + EQUAL_LOG_P)
     return min(likely, key=lambda each: (each[2].shape[2], each[0]))
 
 
@@ -266,7 +266,7 @@ def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Un
         new = find_unexplained(fitter, reduced.fit)
         if not new.found or is_of_group(problem, fit, out, new.about) or not is_predictive(problem, reduced.fit, new):
             continue
-        gain = _held_out_gain(problem, fit, reduced.fit, new) - SETTINGS.indistinguishable - INEXACT * drop
+        gain = _held_out_gain(problem, fit, reduced.fit, new) - SETTINGS.indistinguishable - INTERPOLATION_SHARE * drop
         if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, new
     return (selection, unexplained) if best is None else best[1:]
@@ -308,7 +308,7 @@ def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: st
     own_columns = own_columns - calibration @ (calibration.T @ own_columns)
     group = orthonormal(np.concatenate([calibration, noise.whiten(functions)], axis=1))
     residual = own_columns - group @ (group.T @ own_columns)
-    return bool(((residual**2).sum(axis=0) < OF_GROUP * (own_columns**2).sum(axis=0)).all())
+    return bool(((residual**2).sum(axis=0) < GROUP_RESIDUAL_SHARE * (own_columns**2).sum(axis=0)).all())
 
 
 def _along_axes(functions: Array, axes: int) -> Array:

@@ -39,7 +39,7 @@ from dvl_calib_ros.diagnosis.search.backward_elimination import (
 from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks, intermittent_effects
 from dvl_calib_ros.diagnosis.search.clock_jumps import (
     DELAYS,
-    PARTS,
+    N_PARTS,
     Delays,
     gaps,
     time_by_stamps,
@@ -410,9 +410,9 @@ def test_leaps_of_seconds_are_found_beside_a_lag_and_a_clock_that_is_late_before
 def test_how_a_run_begins_or_ends_is_no_leap():
     """A twin of a DVL that is early lacks its first half second: of T13 a leap at 1.9 s was named for the clock."""
     late, leapt = int(np.argmin(np.abs(DELAYS + 0.5))), int(np.argmin(np.abs(DELAYS - 1.0)))
-    squares = np.full((len(DELAYS), PARTS), 100.0)
+    squares = np.full((len(DELAYS), N_PARTS), 100.0)
     squares[late] = 1.0
-    for part in (0, PARTS - 1):
+    for part in (0, N_PARTS - 1):
         odd = squares.copy()
         odd[late, part], odd[leapt, part] = 100.0, 1.0
         assert _delays(odd) == Delays((-0.5,), ())
@@ -1195,7 +1195,7 @@ def test_what_turns_show_best_of_an_arm_is_said_however_little_they_show():
 
 def test_a_height_that_is_not_said_is_held_where_it_is(monkeypatch):
     """At nothing, half a metre of it was what is left, and right answers were unknown for it."""
-    monkeypatch.setattr(observable_parameters, "SHOWN_FROM", 0.8)
+    monkeypatch.setattr(observable_parameters, "MIN_SHARE", 0.8)
     monkeypatch.setattr(observable_parameters, "ARM_FROM_M", 10.0)
     given = scenario(effects=["lever_arm:x_m=-0.6,y_m=-1.6,z_m=-0.5"], gnss_std=0.01, waves=Waves(0.2, 6.0))
     diagnosis = diagnose_recordings([recording_of(simulate(given), given.gnss_frame, axes="xy")], Parameters())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.diagnosis.model.recorded_streams import UP_TO_S, backward_steps, make_recording
+from dvl_calib_ros.diagnosis.model.recorded_streams import MAX_BACK_S, backward_steps, make_recording
 
 TRUE = np.arange(0.0, 200.0, 0.2)
 STAMPS = TRUE - 1.27 * (TRUE >= 60.0)
@@ -37,7 +37,7 @@ def test_a_short_step_is_where_a_driver_threw_away_what_came_twice(by):
     stamps = TRUE - by * (TRUE >= 60.0)
     kept = np.maximum.accumulate(np.append(-1.0, stamps[:-1])) < stamps
     events, once = backward_steps(stamps[kept], sailed(TRUE)[kept])
-    assert [(each.before, each.by) for each in events] == [(pytest.approx(59.8), UP_TO_S)] and once.all()
+    assert [(each.before, each.by) for each in events] == [(pytest.approx(59.8), MAX_BACK_S)] and once.all()
 
 
 def test_of_two_samples_that_are_stamped_as_one_and_measured_a_second_apart_one_is_kept():

@@ -14,7 +14,7 @@ from dvl_calib_ros.diagnosis.answer.gap_location import places
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fit.cross_validation import held_out_deviance
-from dvl_calib_ros.diagnosis.fit.gauss_newton import SURELY, Fitter
+from dvl_calib_ros.diagnosis.fit.gauss_newton import SKIP_MARGIN, Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import NuisanceFit
 from dvl_calib_ros.diagnosis.model.forward_model import make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
@@ -86,7 +86,7 @@ def test_what_a_step_from_a_fit_at_rest_promises_is_promised_of_no_hypothesis_ne
         return fitter._is_surely_worse(fit.hypothesis, looked, fit.noise, fit.deviance - by, promised)
 
     assert promised > 3.0 and not is_surely_worse(0.0, promised)
-    beyond = 2.0 * SURELY + 0.1
+    beyond = 2.0 * SKIP_MARGIN + 0.1
     assert is_surely_worse(beyond, promised) and not is_surely_worse(beyond, 0.0)
 
 
