@@ -26,7 +26,7 @@ from .numerics.samples import Index, Stamps
 from .registration.registration import Registration
 from .results import results
 from .results.extrinsics import day_covariance
-from .results.held_out_verification import SEVERAL, verify
+from .results.held_out_verification import MAX_ERROR_RATIO, verify
 from .results.results import Estimate, Verification, estimates_lever_arm
 from .results.thinned_recording import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 
@@ -50,7 +50,7 @@ class Assessor:
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
         held_out = self._held_out(name, moments)
         is_suspect = held_out is not None and held_out.corrected > min(
-            SEVERAL * held_out.predicted, held_out.uncorrected
+            MAX_ERROR_RATIO * held_out.predicted, held_out.uncorrected
         )
         typical = self.typical_error(model, state) if is_suspect else None
         samples, vv, *_ = moments.total

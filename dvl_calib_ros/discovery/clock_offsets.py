@@ -19,7 +19,7 @@ from ..calibration.registration.clock_drift_and_jumps import REPORTED_FROM_S
 from ..calibration.registration.frame_hypotheses import Reading, Readings
 from ..calibration.registration.gauss_newton import white_noise
 from ..calibration.registration.motion_streams import MotionStreams, in_order, make_motion, motion_of
-from ..calibration.registration.registration import LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
+from ..calibration.registration.registration import OFFSETS, SMALL_DELAY_S, Registration, register
 from ..calibration.registration.unregistrable_clocks import UnregistrableClocks, far_clocks
 from ..calibration.streams.interpolation import ImuColumns
 from ..calibration.streams.screening import unit_quaternions
@@ -72,7 +72,7 @@ class FoundClocks:
         for name, late in r.offsets.items():
             if name in self.offsets:
                 done = f"subtracted ({name} {late:.2f})"
-            elif name == "dvl_time_offset" and abs(late) < LEFT_TO_CALIBRATION_S:
+            elif name == "dvl_time_offset" and abs(late) < SMALL_DELAY_S:
                 done = "left to the calibration, which estimates it"
             else:
                 done = "not subtracted"

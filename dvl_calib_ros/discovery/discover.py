@@ -19,7 +19,7 @@ from ..calibration.numerics.robust import median
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.configuration_check import BETTER_BY
 from ..calibration.registration.frame_hypotheses import (
-    FITS,
+    MAX_RESIDUAL,
     Agreement,
     ImuFrame,
     Readings,
@@ -366,7 +366,7 @@ class _Search:
         if placed is not None and placed.source:
             return True
         fit = self._chosen  # a reference in the body frame agrees regardless of the IMU
-        return fit is not None and not fit.reading.in_body and fit.best_residual < FITS
+        return fit is not None and not fit.reading.in_body and fit.best_residual < MAX_RESIDUAL
 
     def _fit(
         self,
@@ -394,7 +394,7 @@ class _Search:
             declared = declared.in_base(FRD if self._is_z_down else FLU)
         taken = DECLARED_FRAMES[reading.reference]
         # without an attitude only the body frame could be tried
-        if imu is None and declared is None and chosen.best_residual >= FITS:
+        if imu is None and declared is None and chosen.best_residual >= MAX_RESIDUAL:
             self._notes.append(finding("REFERENCE_FRAME_NOT_TOLD", topic=reference.topic))
         elif taken != declared:
             name = self._values["gnss_frame"] = taken.name
@@ -408,7 +408,7 @@ class _Search:
                 self._contradictions.append(finding("REFERENCE_FRAME_OTHER", topic=reference.topic, **frame))
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
-        if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < FITS:
+        if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < MAX_RESIDUAL:
             residual = self._readings.registered(reading, np.eye(3)).residual
             turned_residual, rotation, *_ = self._readings.registered(reading, None)
             if self._readings.without_noise(turned_residual) < BETTER_BY * self._readings.without_noise(residual):
@@ -425,7 +425,7 @@ class _Search:
         if self._is_given("gnss_aided_std") or self._is_given("use_message_covariance"):
             return
         says_nothing = "use_message_covariance" in self._values
-        if self._readings.without_noise(chosen.best_residual) > FITS:
+        if self._readings.without_noise(chosen.best_residual) > MAX_RESIDUAL:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
         measured_std = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0

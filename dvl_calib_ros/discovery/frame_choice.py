@@ -26,8 +26,8 @@ from ..calibration.numerics.frames import (
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.configuration_check import BETTER_BY, DRAWN, angle_between
 from ..calibration.registration.frame_hypotheses import (
-    FITS,
-    MEANT_WITHIN,
+    MAX_RESIDUAL,
+    NOMINAL_TOL_RAD,
     Agreement,
     ImuFrame,
     Reading,
@@ -389,8 +389,8 @@ def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None
     rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)
     first = also = ""
     about_z = fitting[2] - float(rpy[2])
-    is_drawn = abs(math.remainder(about_z, DRAWN)) < MEANT_WITHIN[2]
-    if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=MEANT_WITHIN[0]):
+    is_drawn = abs(math.remainder(about_z, DRAWN)) < NOMINAL_TOL_RAD[2]
+    if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=NOMINAL_TOL_RAD[0]):
         offset = math.degrees(imu.frame.heading_offset + math.remainder(-about_z if imu.z_down else about_z, math.tau))
         declination = f"set the declination of the compass, here -p heading_offset:={offset:.4g}deg"
         if (given @ travel)[0] > (found @ travel)[0]:
@@ -450,7 +450,7 @@ def twist_axes(look: Look) -> str | None:
     turned = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
     tried = {name: residual(seen) for name, seen in {**turned, "enu": velocity, "ned": velocity @ ENU_FROM_NED}.items()}
     best, second = sorted(tried, key=tried.__getitem__)[:2]
-    if tried[best] > FITS * look.speed or tried[best] > BETTER_BY * tried[second]:
+    if tried[best] > MAX_RESIDUAL * look.speed or tried[best] > BETTER_BY * tried[second]:
         return None
     world = frame_named(look.world, ())
     in_ned = world is not None and world.frame is VelocityFrame.NED

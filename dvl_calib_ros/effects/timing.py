@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.registration.delay_search import LONGEST_S
+from ..calibration.registration.delay_search import FARTHEST_S
 from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory, recursion, slopes
 
 # search range of the clock registration
-LONGEST_OFFSET_S = LONGEST_S
+LONGEST_OFFSET_S = FARTHEST_S
 
 
 def _seconds(what: str) -> tuple[EffectParameter]:

@@ -18,7 +18,7 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.samples import Stream, VelocityFrame
 from ..calibration.numerics.tests import Z_ONE_TEST
-from ..calibration.registration.frame_hypotheses import FITS
+from ..calibration.registration.frame_hypotheses import MAX_RESIDUAL
 from ..calibration.results.mounting_quantities import Quantity, quantities
 from ..calibration.results.results import Estimate
 from ..calibration.streams.position_velocities import NOISY_MPS
@@ -364,7 +364,7 @@ def _disagreement(discovery: Discovery, noise: float) -> list[Reason]:
 
     noise: of the reference per axis, as a share of the speed.
     """
-    if discovery.agreement is None or discovery.agreement.best_residual**2 - 3.0 * noise**2 < FITS**2:
+    if discovery.agreement is None or discovery.agreement.best_residual**2 - 3.0 * noise**2 < MAX_RESIDUAL**2:
         return []
     return [finding("DOCTOR_DISAGREE", left=discovery.agreement.best_residual)]
 

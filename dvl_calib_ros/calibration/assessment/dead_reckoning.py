@@ -39,19 +39,19 @@ from ..results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
 from ..streams.interpolation import GAP_S
 from ..streams.position_velocities import are_positions
 
-# Stretch lengths for the drift, m: the longest with ENOUGH stretches, else the whole track.
+# Stretch lengths for the drift, m: the longest with MIN_STRETCHES stretches, else the whole track.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
-ENOUGH = 3
+MIN_STRETCHES = 3
 # Shortest track, m.
 SHORTEST_M = 20.0
 # Longest interval that is integrated, in usual ones; at least `GAP_S`.
 GAP_INTERVALS = 5.0
 # Ratio of drift with and without calibration that few stretches rarely exceed by noise.
-WORSE = 1.5
+WORSE_RATIO = 1.5
 # Samples compared together, which limits memory.
 COMPARED_AT_ONCE = 2048
 # Points of a track that are kept for a map.
-POINTS = 1500
+MAP_POINTS = 1500
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def dead_reckoned(
     if slow is not None and recording.reference.in_body.all():
         slow = slow._replace(heading=0.0)  # body velocities need no heading
     ends = ends_of_stretches(distance)
-    kept = np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp)
+    kept = np.round(np.linspace(0, len(use) - 1, min(MAP_POINTS, len(use)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
         distance_m=float(distance[-1]),
@@ -263,7 +263,7 @@ def ends_of_stretches(distance: Array) -> Index:
     """Return indices (S + 1,) of the limits of stretches, for the longest length with enough stretches."""
     for length in STRETCHES_M:
         n = int(distance[-1] // length)
-        if n >= ENOUGH:
+        if n >= MIN_STRETCHES:
             return np.asarray(np.searchsorted(distance, length * np.arange(n + 1)).clip(0, len(distance) - 1))
     return np.array([0, len(distance) - 1])
 
@@ -313,10 +313,10 @@ def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Rea
 
     known_to: predicted drift, m per km (σ); an increase within it is only marginal.
     """
-    if navigation is None or navigation.stretches < ENOUGH:
+    if navigation is None or navigation.stretches < MIN_STRETCHES:
         return []
     before, after, noise = navigation.before.per_km, navigation.after.per_km, navigation.noise_per_km
-    if after < WORSE * before or after**2 - before**2 < (2.0 * noise) ** 2:
+    if after < WORSE_RATIO * before or after**2 - before**2 < (2.0 * noise) ** 2:
         if float(metres(after)) <= float(metres(before)):
             return []
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]

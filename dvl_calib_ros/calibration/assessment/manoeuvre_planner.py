@@ -22,12 +22,12 @@ from ..results.results import Estimate
 from ..streams.aligner import Aligner
 
 # Duration and sample interval of a manoeuvre, s, and largest number of manoeuvres.
-TRIED_S, STEP_S, MOST = 60.0, 2.0, 30
+DURATION_S, STEP_S, MAX_MANOEUVRES = 60.0, 2.0, 30
 CIRCLE_RADPS, EIGHT_RADPS = math.radians(6.0), math.radians(12.0)
 DIVE_RAD, DIVE_S = math.radians(10.0), 30.0
 SPEED_PERIOD_S = 20.0
 # Advantage from which another manoeuvre replaces the last suggestion.
-CLEARLY_BETTER = 1.2
+REPLACED_FROM = 1.2
 _COMPASS = (("north", 0.0), ("east", 90.0), ("south", 180.0), ("west", 270.0))
 
 
@@ -101,7 +101,7 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
     gains = np.array([gain for _, gain in tried])
     information = np.linalg.pinv(estimate.velocity_covariance)
     chosen, seconds = None, 0.0
-    for _ in range(MOST):
+    for _ in range(MAX_MANOEUVRES):
         posterior = np.linalg.inv(information + gains)
         drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, posterior, rows))
         best = int(np.argmin(drifts))
@@ -109,12 +109,12 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
             chosen = tried[best][0]
             for at, (reason, _) in enumerate(tried):
                 is_same = before is not None and (reason.code, _name(reason)) == (before.code, _name(before))
-                if is_same and now.both - drifts[best] < CLEARLY_BETTER * (now.both - drifts[at]):
+                if is_same and now.both - drifts[best] < REPLACED_FROM * (now.both - drifts[at]):
                     chosen = reason
         if drifts[best] <= target:
             return Outlook(chosen, seconds + _until(information, gains[best], rows, target))
         information = information + gains[best]
-        seconds += TRIED_S
+        seconds += DURATION_S
     assert chosen is not None  # the list of manoeuvres is not empty
     return Outlook(chosen, None)
 
@@ -128,15 +128,15 @@ def _until(information: Array, gain: Array, rows: Array, target: float) -> float
     shares = np.linspace(0.0, 1.0, 13)[1:]
     posterior = np.linalg.inv(information + shares[:, None, None] * gain)
     drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, posterior, rows))
-    return TRIED_S * float(shares[int(np.argmax(drifts <= target))])
+    return DURATION_S * float(shares[int(np.argmax(drifts <= target))])
 
 
 def _manoeuvres(motion: RecentMotion) -> dict[str, tuple[Reason, tuple[Array, Array, Array]]]:
     """Return by name the wording, and yaw (rad), speed (m/s) and pitch (rad) over time (K,)."""
-    time = np.arange(0.0, TRIED_S, STEP_S)
+    time = np.arange(0.0, DURATION_S, STEP_S)
     heading, u = motion.heading or 0.0, np.full(len(time), motion.speed)
     ahead, level = np.full(len(time), heading), np.zeros(len(time))
-    half = np.where(time < 0.5 * TRIED_S, time, TRIED_S - time)
+    half = np.where(time < 0.5 * DURATION_S, time, DURATION_S - time)
     changing = u * (1.0 + 0.5 * np.sin(2.0 * np.pi * time / SPEED_PERIOD_S))
     found = {
         "faster": (finding("NEXT_FASTER", speed=1.5 * motion.speed), (ahead, 1.5 * u, level)),

@@ -16,11 +16,11 @@ from ..results.results import ARM, OFFSETS, TAPE_STD_M, Estimate
 SUSPICIOUS_GATED = 0.2
 # Share of exactly repeated DVL velocities above which the driver repeats stale data. Share of samples without attitude
 # or turn rate, such as those before the IMU's first, that changes no answer.
-SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
+SUSPICIOUS_REPEATED, UNIMPORTANT_SHARE = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
-OFTEN_OFF = 4.0
+MAX_OFFSETS = 4.0
 # Share of the reference error that yaw absorbs, above which the two are not separable.
-NOT_SHOWN = 0.6
+INSEPARABLE_SHARE = 0.6
 # Uncertainty due to a clock offset that is reported: delay (s), yaw (°); a lever arm from `TAPE_STD_M`.
 REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.1
 # GNSS losses from which reception is unstable.
@@ -56,7 +56,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
         found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=lost))
     if _never_meet(counts):
         found.append(finding("DVL_NO_REFERENCE"))
-    if pairing["without_attitude"] > FEW * dvl["received"]:
+    if pairing["without_attitude"] > UNIMPORTANT_SHARE * dvl["received"]:
         found.append(finding("REFERENCE_NO_ATTITUDE", count=pairing["without_attitude"]))
     if dvl["dropouts"]:
         found.append(finding("DVL_DROPOUTS", count=dvl["dropouts"]))
@@ -68,7 +68,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
         found.append(finding("GNSS_LOSSES", count=pairing["gnss_losses"]))
     if dvl["no_turn_rate"]:
         found.append(finding("NO_TURN_RATE", count=dvl["no_turn_rate"]))
-    if dvl.get("lever_arm_uncompensated", 0) > FEW * dvl["received"]:
+    if dvl.get("lever_arm_uncompensated", 0) > UNIMPORTANT_SHARE * dvl["received"]:
         found.append(finding("LEVER_ARM_NOT_COMPENSATED", count=dvl["lever_arm_uncompensated"]))
     for name, count in counts["calibration"].items():
         if count and name.endswith(" restarted"):
@@ -110,9 +110,9 @@ def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: floa
     at = [own.index(name) for name in OFFSETS]
     turn, p = parameters.rotation_dvl_from_body[:, 2], estimate.filter_covariance
     yaw_by_offset = np.linalg.solve(p[np.ix_(at, at)], p[at, :3] @ turn)
-    if float(np.linalg.norm(yaw_by_offset)) * speed < NOT_SHOWN:
+    if float(np.linalg.norm(yaw_by_offset)) * speed < INSEPARABLE_SHARE:
         return []
-    off = OFTEN_OFF * assumed
+    off = MAX_OFFSETS * assumed
     share = off / speed
     return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
 

@@ -15,10 +15,10 @@ from ..numerics.frames import Array
 from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, median, steps
 
 # Blocks needed.
-ENOUGH = 6
-# Two streams share a topic if squared changes over one sample exceed FURTHER times those over two, plus FURTHER_MPS2,
-# (m/s)², for motion. MOST: share of the blocks in which they must.
-FURTHER, FURTHER_MPS2, MOST = 6.0, 0.02**2, 0.6
+MIN_BLOCKS = 6
+# Two streams share a topic if squared changes over one sample exceed CHANGE_RATIO times those over two, plus
+# CHANGE_MPS2, (m/s)², for motion. MIN_BLOCK_SHARE: share of the blocks in which they must.
+CHANGE_RATIO, CHANGE_MPS2, MIN_BLOCK_SHARE = 6.0, 0.02**2, 0.6
 # Rounding step, as a share of the speed, that changes the mounting by half a degree. Share of repeated values that
 # shows it: noise does not average it out.
 ROUNDED_FROM, REPEATED_FROM = 0.03, 0.4
@@ -42,7 +42,7 @@ class DvlStream:
         one, two = steps(velocity), velocity[2:] - velocity[:-2]
         near, far = (float(median((each**2).sum(axis=1))) for each in (two, one))
         self._blocks += 1
-        self._alternating += far > FURTHER * near + FURTHER_MPS2
+        self._alternating += far > CHANGE_RATIO * near + CHANGE_MPS2
         self._n += len(one)
         size = np.abs(one)
         self._repeated += (size < 1e-6).sum(axis=0)
@@ -53,9 +53,9 @@ class DvlStream:
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the data are not one DVL's measurements."""
-        if self._blocks < ENOUGH:
+        if self._blocks < MIN_BLOCKS:
             return None
-        if self._alternating > MOST * self._blocks:
+        if self._alternating > MIN_BLOCK_SHARE * self._blocks:
             return finding("DVL_TWO_ON_TOPIC")
         rounded = np.where(self._repeated > REPEATED_FROM * self._n, self._step, 0.0)
         step = float(np.where(np.isfinite(rounded), rounded, 0.0).max())

@@ -24,12 +24,12 @@ from ..streams.imu_frame import quaternion_product
 # Interval of differentiation, s: 0.05° of attitude noise become 0.1 °/s. Longer gaps are skipped.
 SPAN_S, LONGEST_S = 0.5, 1.6
 # Turn rate (rms, rad/s) needed for the test.
-LEAST_TURNING = 0.005
+MIN_TURN_RADPS = 0.005
 # Residual share of the squared turn rate: at most with another convention, also relative to the given one, and at least
 # with the given one for a contradiction.
-LEFT_AT_MOST, WRONG_FROM = 0.25, 0.02
+MAX_LEFT_SHARE, MIN_WRONG_SHARE = 0.25, 0.02
 # Conventions within this factor of the best are reported too. Smallest rotation (°) and scale (log) that count as such.
-AS_GOOD, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
+EQUAL_FACTOR, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
 # A rotation with row elements this near 1 only exchanges axes, which is tested separately.
 EXCHANGED_FROM = 0.95
 # Sine of the tilt below which an attitude is a heading only.
@@ -116,18 +116,18 @@ class AttitudeRates:
         """Return the reason, and the convention that fits, if attitude and angular velocity disagree."""
         shown = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
         total = float(np.trace(self._turning[shown, shown]))
-        if self._n < FEWEST_OF_MOTION or total < self._n * LEAST_TURNING**2:
+        if self._n < FEWEST_OF_MOTION or total < self._n * MIN_TURN_RADPS**2:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")
         given = self._misfit(_BODY, np.eye(3), shown)
-        if given < WRONG_FROM * total:
+        if given < MIN_WRONG_SHARE * total:
             return None
         explained = [(self._misfit(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
         best = min(left for left, _ in explained)
-        if best > LEFT_AT_MOST * min(total, given):
+        if best > MAX_LEFT_SHARE * min(total, given):
             return None
-        found, *others = (fits for left, fits in explained if left <= AS_GOOD * best + 1e-3 * total)
+        found, *others = (fits for left, fits in explained if left <= EQUAL_FACTOR * best + 1e-3 * total)
         if others:
             return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
         return finding("IMU_CONTRADICTS", found=found)

@@ -30,15 +30,15 @@ SHIFTS_S: Array = 0.1 * np.arange(-2, 11)
 # Significance of the best of these shifts, σ (Bonferroni).
 Z_BEST_SHIFT = math.sqrt(chi2_isf(chance_of(Z_FIFTY_TESTS) / len(SHIFTS_S), 1.0))
 # Tolerances as shares of the interval: of the intervals in a difference, and of the time between the streams' samples.
-EVEN, NEAR = 0.25, 0.6
+INTERVAL_TOL, TIME_TOL = 0.25, 0.6
 # Differences needed per stretch (three axes); of a slow reference, samples.
-FEWEST = 30
+MIN_DIFFERENCES = 30
 # Share of the noise that is reported. A filter that smooths passes little noise on.
 SHARED_FROM = 0.06
 # Smallest share of noise in the differences; with less they are motion.
-LEAST_SHARE = 0.3
+MIN_NOISE_SHARE = 0.3
 # Largest correlation of differences without a common sample; vibration has more.
-UNCORRELATED_BELOW = 0.15
+MAX_CORRELATION = 0.15
 ORDER = 4
 _LATER = range(ORDER + 1, 2 * ORDER + 1)
 
@@ -91,7 +91,7 @@ class SharedNoise:
         c_4, v_4, v_2 = np.stack([dvl_4 * other_4, dvl_4 * dvl_4, dvl_2 * dvl_2]).sum(axis=(2, 3)) / np.maximum(
             count, 1
         )
-        enough = count >= (FEWEST if reference_step <= SLOWEST_S else FEWEST_VALUES)
+        enough = count >= (MIN_DIFFERENCES if reference_step <= SLOWEST_S else FEWEST_VALUES)
         found = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * enough[:, None]
         self._stretches += enough
         self._sums += found
@@ -99,7 +99,7 @@ class SharedNoise:
 
     def share(self) -> float:
         """Return the share of the DVL's noise in the reference, 0 to about 1; 0 if not significant."""
-        if self._stretches.max() < FEWEST_VALUES or np.abs(self._later).max() > UNCORRELATED_BELOW * self._square:
+        if self._stretches.max() < FEWEST_VALUES or np.abs(self._later).max() > MAX_CORRELATION * self._square:
             return 0.0
         n = np.maximum(self._stretches, 2.0)[:, None]
         mean = self._sums / n
@@ -109,7 +109,7 @@ class SharedNoise:
         if steps < Z_ONE_TEST * float(std[best, 2]):
             steps = 0.0
         passed, own = c_4 - steps, v_4 - steps
-        if own < max(LEAST_SHARE * v_4, 70.0 * ROUNDING_MPS**2):
+        if own < max(MIN_NOISE_SHARE * v_4, 70.0 * ROUNDING_MPS**2):
             return 0.0
         return passed / own if passed > max(SHARED_FROM * own, Z_BEST_SHIFT * float(std[best, 0])) else 0.0
 
@@ -131,7 +131,7 @@ def _nearest(times: Array, step: float, other_times: Array, other: Array, shifts
     wanted = times + shifts[:, None]
     after = np.searchsorted(other_times, wanted).clip(1, len(other_times) - 1)
     near = np.where(wanted - other_times[after - 1] < other_times[after] - wanted, after - 1, after)
-    return np.where((np.abs(other_times[near] - wanted) <= NEAR * step)[..., None], other[near], np.nan)
+    return np.where((np.abs(other_times[near] - wanted) <= TIME_TOL * step)[..., None], other[near], np.nan)
 
 
 def _evenly(times: Array, step: float) -> Mask:
@@ -140,7 +140,7 @@ def _evenly(times: Array, step: float) -> Mask:
 
 
 def _even(times: Array, step: float) -> Mask:
-    return np.asarray(np.abs(np.diff(times) - step) < EVEN * step)
+    return np.asarray(np.abs(np.diff(times) - step) < INTERVAL_TOL * step)
 
 
 def _windows(even: Mask, order: int) -> Mask:

@@ -68,7 +68,7 @@ REPORTED_FROM_RAD = math.radians(0.2)
 # Time constant of smoothing (s) from which the calibration is rejected.
 TOO_SMOOTH_S = 0.6
 # Residual relative to the median, or innovation in σ, beyond which it is an outlier.
-OUTLYING = 4.0
+OUTLIER_RATIO = 4.0
 # Memories of a filter that are tested, s.
 FILTER_MEMORIES_S = 0.5, 1.0, 3.0
 # Samples to either side that predict one.
@@ -334,7 +334,7 @@ def _fitted(
     for _ in range(ROBUST_PASSES):
         square = (rest**2).sum(axis=1)
         level = max(float(median(square)), QUIETEST_MPS**2)
-        weight = 1.0 / np.maximum(square / (OUTLYING**2 * level), 1.0)
+        weight = 1.0 / np.maximum(square / (OUTLIER_RATIO**2 * level), 1.0)
         weighted = columns * weight[:, None, None]
         flat, z = columns.reshape(-1, n), error.reshape(-1)
         prior = level / 3.0 / likely**2
@@ -377,7 +377,7 @@ def _noise_in_reference(
         shares = _innovation_filter(values)
         for filtered, each in ((innovation, values), (rest, error[:, axis])):
             filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
-    limit = OUTLYING * robust_std(innovation)
+    limit = OUTLIER_RATIO * robust_std(innovation)
     # gaps break the prediction
     is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
     innovation[np.convolve(is_gap, np.ones(2 * NEIGHBOURS), "same") > 0.5] = 0.0

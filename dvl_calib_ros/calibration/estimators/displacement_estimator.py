@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..assessment.dead_reckoning import POINTS, SHORTEST_M, Navigation, drift_over, ends_of_stretches
+from ..assessment.dead_reckoning import MAP_POINTS, SHORTEST_M, Navigation, drift_over, ends_of_stretches
 from ..assessment.model_selection import NO_EVIDENCE, Evidence
 from ..filters.cross_validation import FOLDS, HeldOutError, Moments, held_out_from_sums
 from ..filters.filter_bank import ModelCounts
@@ -40,10 +40,10 @@ from .displacement_least_squares import (
 from .estimator import NEVER, SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup
 
 # Time of the first solution, s, and growth of the run between solutions.
-FIRST_LOOK_S, GROWN = 60.0, 1.2
+FIRST_LOOK_S, GROWTH = 60.0, 1.2
 # Velocities from positions are too noisy beyond NOISY_MPS. They do not exist for fixes further apart than this number
 # of windows (position_velocities.py).
-LONGEST_WINDOWS = 3.0
+MAX_WINDOWS = 3.0
 
 
 class _Look(NamedTuple):
@@ -110,7 +110,7 @@ class Displacements(Estimator):
         while self._first_ns is not None and self._next_ns <= self._oriented_ns:
             self._look(self._next_ns)
             passed_s = 1e-9 * (self._next_ns - self._first_ns)
-            self._next_ns = self._first_ns + round(1e9 * math.ceil(passed_s * GROWN))
+            self._next_ns = self._first_ns + round(1e9 * math.ceil(passed_s * GROWTH))
         self._let_take_effect(self._oriented_ns)
 
     def _look(self, at_ns: int) -> None:
@@ -253,7 +253,7 @@ def _noise_of_velocities(legs: Legs, parameters: Parameters) -> float:
     if len(legs.seconds) < N_ERRORS:
         return 0.0
     interval, window_s = float(np.median(np.diff(legs.seconds))), parameters.position_window
-    if interval > LONGEST_WINDOWS * window_s:
+    if interval > MAX_WINDOWS * window_s:
         return math.inf
     return math.sqrt(2.0) * white_noise(legs, np.array(parameters.lever_arm)) / max(window_s, interval)
 
@@ -305,7 +305,7 @@ def navigated(
     reference = np.cumsum(steps(legs.position), axis=0)
     stretch_m = float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]])
     noise = float(np.sqrt(2.0 * np.var(of_all[at, :2], axis=0).sum()))
-    kept = np.round(np.linspace(0, len(at) - 1, min(POINTS, len(at)))).astype(np.intp)
+    kept = np.round(np.linspace(0, len(at) - 1, min(MAP_POINTS, len(at)))).astype(np.intp)
     in_body = [_velocities(each, seconds, legs.rotation[at])[kept] for each in astray]
     return Navigation(
         distance_m=float(distance[-1]),

@@ -25,13 +25,13 @@ from ..numerics.samples import Index, Mask, Stamps
 N_ERRORS, N_THETA = 4, 13
 SCALE, ARM, LATE, DEVIATION, DRIFT = 3, slice(4, 7), 7, slice(8, 13), 12
 # Largest number of blocks of time, which are solved together.
-MOST_BLOCKS = 120
+MAX_BLOCKS = 120
 # A fix is an outlier beyond this number of σ from the median of its neighbours to either side.
-OUTLYING, NEIGHBOURS = 4.5, 6
+OUTLIER_Z, NEIGHBOURS = 4.5, 6
 # Limit for outliers that last for minutes, in σ from the median of a stretch; drift spreads evenly and stays below.
-FAR_OUT = 6.0
+LASTING_OUTLIER_Z = 6.0
 # Huber's bound, σ, in the first fit.
-HUBER = 1.5
+HUBER_Z = 1.5
 # Noise hypotheses. LASTING: variance of the Gauss-Markov process relative to a block's white variance; LASTING_S: its
 # memory, s. WALKED: variance of the random walk after WALK_S, relative to the same. DEVIATES: heading deviation
 # relative to its parameter.
@@ -42,10 +42,10 @@ DEVIATES: Array = np.array([0.3, 1.0, 3.0])
 _DEVIATES_LOG: Array = -0.5 * (np.log(DEVIATES) / np.log(4.0)) ** 2
 _SHARE: Array = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
 # Variance of a stretch's constant, relative to the largest other variance.
-ANYWHERE = 1e5
+FREE_VARIANCE = 1e5
 # Smallest noise of a fix against dead reckoning, m: in turns a delayed fix is wrong by half the acceleration times
 # delay².
-FINEST_M = 0.3
+MIN_NOISE_M = 0.3
 
 
 class DisplacementFit(NamedTuple):
@@ -182,7 +182,7 @@ def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
         theta = np.linalg.solve(square[1:, 1:] + np.diag((level / std) ** 2), square[1:, 0])
         left = np.abs(centred[..., 0] - centred[..., 1:] @ theta)
         level = max(float(median(left.ravel())) * 1.4826, 1e-6)
-        weight = np.minimum(1.0, HUBER * level / np.maximum(left, 1e-9))
+        weight = np.minimum(1.0, HUBER_Z * level / np.maximum(left, 1e-9))
     return theta
 
 
@@ -200,12 +200,12 @@ def _no_outliers(left: Array, stretch: Index) -> Mask:
     places = np.clip(np.arange(n)[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, n - 1)
     near = np.where((stretch[places] == stretch[:, None])[..., None], left[places], np.nan)
     away = left - np.nanmedian(near, axis=1)
-    near_enough = np.abs(away) < OUTLYING * np.maximum(robust_std(away), 1e-6)
+    near_enough = np.abs(away) < OUTLIER_Z * np.maximum(robust_std(away), 1e-6)
     centred = left.copy()
     for each in np.unique(stretch):
         own = stretch == each
         centred[own] -= median(left[own])
-    in_reach = np.abs(centred) < FAR_OUT * np.maximum(robust_std(centred), FINEST_M)
+    in_reach = np.abs(centred) < LASTING_OUTLIER_Z * np.maximum(robust_std(centred), MIN_NOISE_M)
     return np.asarray((near_enough & in_reach).all(axis=1))
 
 
@@ -213,7 +213,7 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
     """Average the fixes in use over blocks of time."""
     at = np.flatnonzero(use)
     seconds = legs.seconds[at]
-    length = max(BLOCK_S, float(seconds[-1] - seconds[0]) / MOST_BLOCKS)
+    length = max(BLOCK_S, float(seconds[-1] - seconds[0]) / MAX_BLOCKS)
     number = np.floor((seconds - seconds[0]) / length).astype(np.intp)
     key = np.stack([legs.stretch[at], number])
     first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))
@@ -227,7 +227,7 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
     # a stretch of one block holds no information, as its constant is free; of very many stretches the longest suffice
     names, sizes = np.unique(stretch, return_counts=True)
     longest = np.argsort(-sizes, kind="stable")
-    kept = longest[(sizes[longest] > 1) & (np.cumsum(sizes[longest]) <= max(2 * MOST_BLOCKS, int(sizes.max())))]
+    kept = longest[(sizes[longest] > 1) & (np.cumsum(sizes[longest]) <= max(2 * MAX_BLOCKS, int(sizes.max())))]
     of_use = np.isin(stretch, names[kept])
     return _Blocks(mean(seconds)[of_use], stretch[of_use], weight[of_use], y[of_use].T, columns[of_use].swapaxes(0, 1))
 
@@ -243,7 +243,7 @@ def _hypotheses(blocks: _Blocks) -> Array:
     lasting = [np.zeros_like(apart)] + [size * np.exp(-apart / tau) for size in LASTING for tau in LASTING_S]
     each = np.array([one + more * walk for one in lasting for more in WALKED]) * usual + np.diag(white)
     most = np.diagonal(each, axis1=1, axis2=2).max(axis=1)
-    return np.asarray(each + ANYWHERE * most[:, None, None] * same)
+    return np.asarray(each + FREE_VARIANCE * most[:, None, None] * same)
 
 
 def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float]:
@@ -266,14 +266,14 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     wider = np.ones((len(DEVIATES), N_THETA))
     wider[:, DEVIATION] = DEVIATES[:, None]
     known = np.linalg.inv(prior.p * wider[:, :, None] * wider[:, None, :])
-    level = np.maximum(yy / max(freedom, 1.0), FINEST_M**2)[:, None] * np.ones(len(DEVIATES))
+    level = np.maximum(yy / max(freedom, 1.0), MIN_NOISE_M**2)[:, None] * np.ones(len(DEVIATES))
     for _ in range(6):
         information = known + told[:, None] / level[..., None, None]
         vector = (known @ prior.x) + by[:, None] / level[..., None]
         x = np.linalg.solve(information, vector[..., None])[..., 0]
         left = yy[:, None] - 2.0 * (x * by[:, None]).sum(axis=-1) + np.einsum("gfi,gij,gfj->gf", x, told, x)
         spent = np.trace(np.linalg.solve(information, told[:, None] / level[..., None, None]), axis1=2, axis2=3)
-        level = np.maximum(left / np.maximum(freedom - spent, 1.0), FINEST_M**2)
+        level = np.maximum(left / np.maximum(freedom - spent, 1.0), MIN_NOISE_M**2)
     information = known + told[:, None] / level[..., None, None]
     p = np.linalg.inv(information)
     away = x - prior.x

@@ -12,11 +12,11 @@ from ..models.parameters import Parameters
 from ..numerics.frames import Array, product
 from .full_forward_model import FitBlock, JoinedBlocks, joined_blocks
 
-# Grid of delays, s, for up to SEARCHED_BLOCKS blocks. A delay is taken if its chi-square is smaller by CLEARLY, where
-# ALIKE_ROWS correlated rows count as one independent row. FEWEST_ROWS rows are needed.
+# Grid of delays, s, for up to SEARCHED_BLOCKS blocks. A delay is taken if its chi-square is smaller by MIN_CHI2_GAIN.
+# CORRELATED_ROWS rows count as one independent row. MIN_ROWS rows are needed.
 STEP_S = 0.2
 DELAYS_S: Array = STEP_S * np.arange(-16, 17)
-SEARCHED_BLOCKS, CLEARLY, ALIKE_ROWS, FEWEST_ROWS = 64, 30.0, 5.0, 40
+SEARCHED_BLOCKS, MIN_CHI2_GAIN, CORRELATED_ROWS, MIN_ROWS = 64, 30.0, 5.0, 40
 
 
 def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameters) -> float:
@@ -30,7 +30,7 @@ def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameter
     best = int(np.argmin(squares))
     now = float(np.interp(delay, DELAYS_S, squares))
     n = sum(len(each.body) for each in rows)
-    is_clear = n * math.log(now / squares[best]) > CLEARLY * ALIKE_ROWS
+    is_clear = n * math.log(now / squares[best]) > MIN_CHI2_GAIN * CORRELATED_ROWS
     return float(DELAYS_S[best]) if is_clear and abs(DELAYS_S[best] - delay) > STEP_S else delay
 
 
@@ -60,7 +60,7 @@ def _left_by_delay(each: Sequence[_DvlAtDelays]) -> Array | None:
     Velocity and rates of three axes have free coefficients, which include mounting, scale and lever arm.
     """
     body = np.concatenate([own.body for own in each])[:, :2]
-    if len(body) < FEWEST_ROWS:
+    if len(body) < MIN_ROWS:
         return None
     velocity = np.concatenate([own.velocity for own in each], axis=1)
     rates = np.concatenate([own.rates for own in each])

@@ -29,39 +29,39 @@ from ..results.results import TAPE_STD_M
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
-from .section_rows import GATE, SectionRows, effects_gram, masked_median, section_starts, usual_square
+from .section_rows import GATE_SQUARE, SectionRows, effects_gram, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
 OF_DAY = FULL.of_day
 LINEARISED = np.r_[PHI, SCALE, LEVER_ARM, DELAY, REFERENCE_DELAY]  # states that are not linear
 OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
 # The point of linearisation is renewed when an angle, scale, lever arm or delay has moved by this number of σ.
-FAR = 1.0
-# Gauss-Newton steps at a renewal: at most STEPS, or until a step is below LAST_STEP σ.
-STEPS, LAST_STEP = 8, 0.3
+RELINEARISED_FROM = 1.0
+# Gauss-Newton steps at a renewal: at most MAX_STEPS, or until a step is below LAST_STEP σ.
+MAX_STEPS, LAST_STEP = 8, 0.3
 # Blocks whose streams are kept (40 minutes), because a node's memory must not grow. Older ones contribute a fixed sum,
 # and registration uses at most the rows of a third of them.
 KEPT_BLOCKS = 240
 # Points of the slow errors' prior for the numerical integration.
-POINTS = 16
-# The points are re-centred when the data move them by OFF_CENTRE σ of the prior, at most RECENTRED times.
-OFF_CENTRE, RECENTRED = 0.7, 4
+N_POINTS = 16
+# The points are re-centred when the data move them by RECENTRED_FROM σ of the prior, at most MAX_RECENTRED times.
+RECENTRED_FROM, MAX_RECENTRED = 0.7, 4
 # Prior probability of each exception: a wrong configured lever arm, a vehicle that sinks or rises by its trim, one that
 # dives, and a large vertical error of the reference.
-EXCEPTION = 0.1
+P_EXCEPTION = 0.1
 # A vehicle at the surface or at constant depth ends at the height at which it began, within LEVEL_M (tide, waves) and
-# its own excursions; else it sinks or rises by its trim (σ SLOW_MPS), or dives (σ CLIMB_MPS).
-LEVEL_M, SLOW_MPS, CLIMB_MPS = 1.0, 0.02, 0.3
+# its own excursions; else it sinks or rises by its trim (σ TRIM_STD_MPS), or dives (σ DIVE_STD_MPS).
+LEVEL_M, TRIM_STD_MPS, DIVE_STD_MPS = 1.0, 0.02, 0.3
 # σ of a large vertical reference error (an antenna's model), m/s, instead of `reference_offset_std`.
-OFFSET_MPS = 0.05
+OFFSET_STD_MPS = 0.05
 # Degrees of freedom needed to estimate the noise of bins.
-FEWEST = 6
+MIN_DOF = 6
 # Squared residual of three axes, in variances, beyond which a row is an outlier.
-GATED = 4.0 * GATE
+OUTLIER_SQUARE = 4.0 * GATE_SQUARE
 # A section is rejected if its median differs from the others' by GROSS of their σ and by GROSS_MPS (m/s): no slow error
 # is so large.
 GROSS, GROSS_MPS = 10.0, 0.5
-_UNIT_POINTS: Array = normal_points(5, POINTS)
+_UNIT_POINTS: Array = normal_points(5, N_POINTS)
 
 
 class _Section(NamedTuple):
@@ -174,9 +174,9 @@ class JointFit:
         assert self._fitted is not None
         if any(day.before is not None for day in self._days):
             return
-        for _ in range(RECENTRED):
+        for _ in range(MAX_RECENTRED):
             moved = self._fitted.weights @ _UNIT_POINTS
-            if np.abs(moved).max() < OFF_CENTRE:
+            if np.abs(moved).max() < RECENTRED_FROM:
                 return
             self._centre = self._centre + moved
             self._slow, self._deviation, self._log_prior = self._points()
@@ -273,7 +273,7 @@ class JointFit:
 
     def _is_far(self) -> bool:
         assert self._fitted is not None
-        moved = np.abs(self._x - self._linear) > FAR * np.sqrt(np.diag(self._fitted.state.p))
+        moved = np.abs(self._x - self._linear) > RELINEARISED_FROM * np.sqrt(np.diag(self._fitted.state.p))
         return any(moved[self._of_day(number)][LINEARISED].any() for number in range(len(self._days)))
 
     # ------------------------------------------------------------------ linearisation
@@ -283,7 +283,7 @@ class JointFit:
         place = self._of_day(len(self._days) - 1)[DELAY]
         self._x[place] = better_delay(self._days[-1].blocks, float(self._x[place]), self._parameters)
         last = np.zeros_like(self._x)
-        for _ in range(STEPS):
+        for _ in range(MAX_STEPS):
             self._linearise()
             before = self._x.copy()
             self._solve()
@@ -350,7 +350,7 @@ class JointFit:
         each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
         total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))
         white = np.maximum(total / np.maximum(freedom, 1.0), ROUNDING_MPS**2)
-        day.white = np.where(freedom < FEWEST, day.single, white)
+        day.white = np.where(freedom < MIN_DOF, day.single, white)
 
     def _add_parts(self, day: _Day, parts: Sequence[SectionRows], x: Array) -> None:
         """Add sections to their day's chain. x: (20,) point of linearisation."""
@@ -366,7 +366,7 @@ class JointFit:
                 self._gated += len(part.rows.times)
             elif part.rows is not None and np.isfinite(day.white).all():
                 misfit = part.misfit(day.single)
-                good = misfit <= GATED
+                good = misfit <= OUTLIER_SQUARE
                 self.used += int(np.count_nonzero(good))
                 self._gated += int(np.count_nonzero(~good))
                 self._misfit += float(misfit[good].sum())
@@ -478,7 +478,7 @@ class JointFit:
                 velocity = up[:, :-1] @ self._x[at] + up[:, -1]
                 path = BLOCK_S * np.cumsum(velocity - velocity.mean())
                 std = (LEVEL_M + float(np.ptp(path))) / (BLOCK_S * len(up))
-                found.append(_Climb(at, up.mean(axis=0), min(std, CLIMB_MPS)))
+                found.append(_Climb(at, up.mean(axis=0), min(std, DIVE_STD_MPS)))
         return found
 
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice, climbs: Sequence[_Climb]) -> JointEstimate:
@@ -525,9 +525,9 @@ class JointFit:
         """
         key = points.start, points.stop, seen_climbing, len(self._days)
         if key not in self._known:
-            arms = {TAPE_STD_M: 1.0 - EXCEPTION, math.inf: EXCEPTION} if self._arm_is_given else {math.inf: 1.0}
-            offsets = {0.0: 1.0 - EXCEPTION, OFFSET_MPS: EXCEPTION} if seen_climbing else {0.0: 1.0}
-            climbs = {SLOW_MPS: EXCEPTION, CLIMB_MPS: EXCEPTION} if seen_climbing else {}
+            arms = {TAPE_STD_M: 1.0 - P_EXCEPTION, math.inf: P_EXCEPTION} if self._arm_is_given else {math.inf: 1.0}
+            offsets = {0.0: 1.0 - P_EXCEPTION, OFFSET_STD_MPS: P_EXCEPTION} if seen_climbing else {0.0: 1.0}
+            climbs = {TRIM_STD_MPS: P_EXCEPTION, DIVE_STD_MPS: P_EXCEPTION} if seen_climbing else {}
             paths = {0.0: 1.0 - sum(climbs.values()), **climbs}
             cases = list(itertools.product(arms, offsets))
             priors = [self._by_prior(points, arm, offset) for arm, offset in cases]

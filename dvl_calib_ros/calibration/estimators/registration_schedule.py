@@ -35,11 +35,11 @@ from .full_fit import KEPT_BLOCKS, JointFit
 from .full_forward_model import deviation_of
 
 # Live, registration is repeated once the number of blocks has grown by this factor.
-AGAIN_FROM = 1.5
+REPEATED_AT_GROWTH = 1.5
 # Blocks needed for a registration, and before the first live one (a minute).
-ENOUGH, FIRST_LOOK = 2, 6
+MIN_BLOCKS, FIRST_LIVE_BLOCKS = 2, 6
 # Rows of each stream in a 10 s block.
-MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
+ROWS_PER_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 
 
 class _DvlVelocities(RowTable):
@@ -84,7 +84,7 @@ class _Registered:
     def take_room(self) -> None:
         """Reserve the final size now, so that memory does not grow for 40 minutes."""
         for stream in self._streams:
-            stream.reserve((KEPT_BLOCKS + 1) * MOST_OF_A_BLOCK)
+            stream.reserve((KEPT_BLOCKS + 1) * ROWS_PER_BLOCK)
 
     def add(self, kept: ThinnedBlock) -> None:
         """Add a block, and drop the oldest beyond `KEPT_BLOCKS`."""
@@ -178,7 +178,7 @@ class KeptClocks:
 
     def look_again(self, fit_so_far: FitSoFar | None) -> None:
         """Repeat the registration if there is enough new data. fit_so_far: the fit so far; None without data."""
-        if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest.blocks, FIRST_LOOK):
+        if self._over is None and self._blocks >= max(REPEATED_AT_GROWTH * self._latest.blocks, FIRST_LIVE_BLOCKS):
             self._latest = self._look(fit_so_far)
 
     def looked(self, fit_so_far: FitSoFar | None = None, *, fresh: bool = True) -> Looked:
@@ -198,7 +198,7 @@ class KeptClocks:
 
     def _look(self, fit_so_far: FitSoFar | None) -> Looked:
         """Register the kept blocks, unless registration is known."""
-        motion = self._seen.motion() if self._known is None and len(self._seen) >= ENOUGH else None
+        motion = self._seen.motion() if self._known is None and len(self._seen) >= MIN_BLOCKS else None
         if motion is None:
             return Looked(self._blocks, self._known)
         nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)

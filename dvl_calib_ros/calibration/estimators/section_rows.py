@@ -15,9 +15,9 @@ from ..numerics.robust import median
 from .full_forward_model import SPAN_S, FitBlock, PredictedRows
 from .slow_errors import WIDTH, Bins, Chain, SlowErrors, binned_rows, gram_of
 
-DENSER = 0.7  # references are denser than the DVL below this ratio of intervals
+DENSER_RATIO = 0.7  # references are denser than the DVL below this ratio of intervals
 # Squared residual of three axes, in variances, that 1 % of good rows exceed. Beyond it a row has weight gate / misfit.
-GATE = 11.3
+GATE_SQUARE = 11.3
 # Mean of the smaller 90 % of squares of a standard normal variable.
 TRIMMED_SQUARE = 0.623
 
@@ -64,7 +64,7 @@ class SectionRows:
         """Average the rows over bins, with robust weights. single: see `misfit`."""
         assert self.rows is not None
         if self._bins is None:
-            weight = np.minimum(1.0, GATE / np.maximum(self.misfit(single), 1e-9))
+            weight = np.minimum(1.0, GATE_SQUARE / np.maximum(self.misfit(single), 1e-9))
             self._bins = binned_rows(self.rows, weight, self.from_s, self.from_s + BLOCK_S, self._bin_s)
         return self._bins
 
@@ -108,7 +108,7 @@ def _bin_length_s(block: FitBlock) -> float:
     if len(times) < 2 or len(block.dvl.times) < 2:
         return SPAN_S
     apart = (times[-1] - times[0]) / (len(times) - 1)
-    return block.slope_reach_s if apart < DENSER * block.interval_s else SPAN_S
+    return block.slope_reach_s if apart < DENSER_RATIO * block.interval_s else SPAN_S
 
 
 def section_starts(block: FitBlock) -> list[float]:

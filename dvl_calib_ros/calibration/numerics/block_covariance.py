@@ -21,17 +21,17 @@ from .tests import chi2_isf
 BLOCK_S, BLOCK_NS = 10.0, 10_000_000_000
 # Most blocks. When full, neighbours are joined and the block length doubles: memory is bounded, and the scatter covers
 # effects of minutes.
-MOST = 64
+MAX_BLOCKS = 64
 # Fewest blocks of a scatter: with 8 its relative σ is a quarter.
-FEWEST = 8
-# Upper-tail probabilities of the scatter: beyond CHANCE σ is inflated, and the excess beyond RARELY is scaled by
+MIN_BLOCKS = 8
+# Upper-tail probabilities of the scatter: beyond CHANCE σ is inflated, and the excess beyond RARE is scaled by
 # Student's t, so that 3 σ keep their probability with few blocks.
-CHANCE, RARELY = 0.1, 0.02
+CHANCE, RARE = 0.1, 0.02
 # Smallest equivalent number of blocks with equal information.
 FEWEST_ALIKE = 5.0
 # Fewest blocks for a correlation of neighbours, significant coefficient in σ (1/√m), and largest coefficient used. A
 # higher threshold would miss noise as long as a block in half of the four-minute recordings.
-LASTING_FROM, LASTS, MOST_LASTING = 16, 1.5, 0.85
+MIN_LASTING_BLOCKS, LASTING_Z, MAX_CORRELATION = 16, 1.5, 0.85
 
 
 class TimeBlocks:
@@ -41,7 +41,7 @@ class TimeBlocks:
     """
 
     def __init__(self) -> None:
-        # capacity: MOST blocks
+        # capacity: MAX_BLOCKS blocks
         self._information = np.zeros((0, 0, 0, 0))
         self._vector = np.zeros((0, 0, 0))
         self.total: tuple[Array, Array] = np.zeros((0, 0, 0)), np.zeros((0, 0))
@@ -66,10 +66,10 @@ class TimeBlocks:
             return
         if not self.count:
             # filled, so that the memory is allocated now and not over ten minutes
-            self._information = np.full((MOST, *information.shape), np.nan)
-            self._vector = np.full((MOST, *vector.shape), np.nan)
-        if self.count == MOST:
-            self.count = MOST // 2
+            self._information = np.full((MAX_BLOCKS, *information.shape), np.nan)
+            self._vector = np.full((MAX_BLOCKS, *vector.shape), np.nan)
+        if self.count == MAX_BLOCKS:
+            self.count = MAX_BLOCKS // 2
             for each in (self._information, self._vector):
                 each[: self.count] = each[0::2] + each[1::2]
             self._each *= 2
@@ -111,7 +111,7 @@ class TimeBlocks:
         information, vector = (each[:, index].copy() for each in self.kept)
         return BlocksOfOne(information, vector, self.total[0][index])
 
-    def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTS, rarely: float | None = RARELY) -> Array:
+    def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTING_Z, rarely: float | None = RARE) -> Array:
         """Return `inflations` for one of the K, x (n,), P (n, n)."""
         return inflations([self.of(index)], x[None], p[None], lasts=lasts, rarely=rarely)[0]
 
@@ -133,19 +133,19 @@ def inflations(
     x: Array,
     p: Array,
     variance: Array | None = None,
-    lasts: float = LASTS,
-    rarely: float | None = RARELY,
+    lasts: float = LASTING_Z,
+    rarely: float | None = RARE,
 ) -> Array:
     """Return the σ inflation factors (S, n), at least 1, of estimates x (S, n), P (S, n, n).
 
     A factor is the largest over single blocks and over blocks joined by two and four. variance: (S, r) of r other
-    quantities, with p (S, r, n) their covariance with the states. lasts, rarely: see `LASTS` and `RARELY`; rarely None:
+    quantities, with p (S, r, n) their covariance with the states. lasts, rarely: see `LASTING_Z` and `RARE`; None:
     without the factor of Student's t, for thresholds above 3 σ.
     """
     variance = np.diagonal(p, axis1=1, axis2=2) if variance is None else variance
     factor = np.ones(variance.shape)
     counts = np.array([len(each.vector) for each in blocks])
-    for count in sorted(set(counts[counts >= FEWEST].tolist())):
+    for count in sorted(set(counts[counts >= MIN_BLOCKS].tolist())):
         at = np.flatnonzero(counts == count)
         scores = np.stack([blocks[number].vector - blocks[number].information @ x[number] for number in at.tolist()])
         information = np.stack([blocks[number].information for number in at.tolist()])
@@ -159,7 +159,7 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
     """Return factors (S, r) from scores (S, m, n) and the shares (S, m, r) of the variance that they claim."""
     factor = np.ones(variance.shape)
     claimed = parts.sum(axis=1)
-    while scores.shape[1] >= FEWEST:
+    while scores.shape[1] >= MIN_BLOCKS:
         m = scores.shape[1]
         scatter = p @ scores.swapaxes(1, 2)
         longer = _lasting(scatter, lasts)
@@ -204,9 +204,9 @@ def _lasting(scatter: Array, lasts: float) -> Array:
     subtracted mean (Kendall, 1954). It covers noise that lasts longer than a block.
     """
     m = scatter.shape[-1]
-    if m < LASTING_FROM:
+    if m < MIN_LASTING_BLOCKS:
         return np.ones(scatter.shape[:-1])
     correlation = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
-    rho = np.clip((correlation + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MOST_LASTING)
+    rho = np.clip((correlation + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MAX_CORRELATION)
     more = (1.0 + rho) / (1.0 - rho)
     return np.asarray(np.where(correlation > lasts / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))

@@ -30,15 +30,15 @@ LAGS_S = 0.03
 # (five real recordings: 0.03 to 0.07 s).
 REPORTED_FROM_S = 0.1
 # Thresholds of a clock change: chi-square gain, and largest residual chi-square per degree of freedom.
-GAIN, LEFT = 18.0, 4.0
+MIN_CHI2_GAIN, MAX_CHI2_LEFT = 18.0, 4.0
 # Smallest gap in the stamps as a share of the forward step that caused it.
-HOLE = 0.8
+MIN_GAP_SHARE = 0.8
 # Limits of the parameters `dvl_clock_drift`, s/s, and `dvl_time_jump`, s.
-MOST_DRIFT, MOST_LEAP_S = 0.01, 10.0
+MAX_DRIFT, MAX_JUMP_S = 0.01, 10.0
 # Length of the stretches, s, and most stretches of a recording.
-STRETCH_S, MOST_STRETCHES = 90.0, 16
+STRETCH_S, MAX_STRETCHES = 90.0, 16
 # Chi-square cost of a stretch with a free delay, and fewest stretches on either side of a step.
-ANYTHING, EACH_SIDE = 10.0, 2
+FREE_DELAY_CHI2, STRETCHES_A_SIDE = 10.0, 2
 NO_STREAMS: Mapping[str, Array] = {}
 
 
@@ -92,7 +92,7 @@ class ClockChange:
 
     def corrections(self, epoch_ns: int) -> dict[str, float]:
         """Return the parameters that correct a change of the DVL clock. epoch_ns: stamp of time 0."""
-        if self.whose != "dvl" or abs(self.drift) > MOST_DRIFT or abs(self.leap) > MOST_LEAP_S:
+        if self.whose != "dvl" or abs(self.drift) > MAX_DRIFT or abs(self.leap) > MAX_JUMP_S:
             return {}
         if self.drift:
             return {"dvl_clock_drift": round(self.drift, 7)}
@@ -142,13 +142,13 @@ def stamps(motion: MotionStreams) -> Mapping[str, Array]:
 
 def _reach(times: Array) -> float:
     """Return the uncertainty (s) of the time of a step within times (N,)."""
-    return float(np.ptp(times)) / MOST_STRETCHES + STRETCH_S
+    return float(np.ptp(times)) / MAX_STRETCHES + STRETCH_S
 
 
 def _holes(times: Array, jump: float, at: float, reach: float) -> Index:
     """Return indices of times (N,) before gaps of the size of a step (s), within reach of it."""
     gap = np.diff(times)
-    return np.flatnonzero((gap > HOLE * jump) & (np.abs(times[1:] - at) < reach + gap))
+    return np.flatnonzero((gap > MIN_GAP_SHARE * jump) & (np.abs(times[1:] - at) < reach + gap))
 
 
 def unsteady(
@@ -158,7 +158,7 @@ def unsteady(
 
     streams: stamps of each stream; a clock whose stamps have no gap has no forward step.
     """
-    if len(times) < 2 * EACH_SIDE:
+    if len(times) < 2 * STRETCHES_A_SIDE:
         return None
     # a delay without acceleration looks like a lever arm, which is the same in all stretches
     states = [*range(N)[ARM], DELTA, RHO]
@@ -180,7 +180,7 @@ def unsteady(
         for name, direction in names.items():
             moved = np.outer(course.of, (0.0, 0.0, 0.0, *direction))
             left, value, std = _explained(seen, weight, moved, course.kept)
-            left += ANYTHING * (not course.kept.all())
+            left += FREE_DELAY_CHI2 * (not course.kept.all())
             if course.fits(value, streams.get(name) if is_turned else None, _reach(times)):
                 found.append((left, value, std, name, course))
     left, value, std, name, course = min(found, key=lambda each: each[0])
@@ -189,8 +189,8 @@ def unsteady(
     scatter = max(1.0, left / (seen.size - len(states) - 1.0))
     std *= math.sqrt(scatter)
     is_large = abs(value) * length > REPORTED_FROM_S and abs(value) > Z_SLOW_ERRORS * std
-    is_shown = is_large and still - left > GAIN * scatter
-    if not is_shown or left > min(but_one) + ANYTHING * scatter or scatter > LEFT:
+    is_shown = is_large and still - left > MIN_CHI2_GAIN * scatter
+    if not is_shown or left > min(but_one) + FREE_DELAY_CHI2 * scatter or scatter > MAX_CHI2_LEFT:
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)
     whose = name if is_turned and others - left > RULED_OUT * scatter else ""
@@ -200,9 +200,9 @@ def unsteady(
 def _leaps(times: Array) -> Iterator[_Course]:
     """Yield steps between two stretches, and within one."""
     n = np.arange(len(times))
-    for at in range(EACH_SIDE, len(times) - EACH_SIDE + 1):
+    for at in range(STRETCHES_A_SIDE, len(times) - STRETCHES_A_SIDE + 1):
         yield _Course((n >= at).astype(float), n >= 0, float(times[at - 1 : at + 1].mean()))
-        if at < len(times) - EACH_SIDE:
+        if at < len(times) - STRETCHES_A_SIDE:
             yield _Course((n > at).astype(float), n != at, float(times[at]))
 
 

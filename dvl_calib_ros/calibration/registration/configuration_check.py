@@ -19,9 +19,9 @@ from ..numerics.robust import FEWEST_OF_MOTION
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
 from ..streams.interpolation import GAP_S, attitude_at
-from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
+from .gauss_newton import ARM, FULL_ROWS, QUICK_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion_streams import Curves, MotionStreams
-from .registration import GAIN, INDEPENDENT_S, Registration
+from .registration import INDEPENDENT_S, LOG_GAIN, Registration
 from .unregistrable_clocks import MOVING_MPS
 
 # Detection of velocities in an earth frame: their direction rotates with the heading.
@@ -29,9 +29,9 @@ from .unregistrable_clocks import MOVING_MPS
 # into the earth frame agree with an earth-frame reference without residual, so only the heading reveals them.
 
 # Mean resultant length: directions agree above, and headings differ below (25° about their mean).
-ALIKE = 0.9
+MIN_RESULTANT = 0.9
 # Largest ratio of the spread in the earth frame to the spread in the body frame for earth-frame velocities.
-CLEARLY = 0.25
+MAX_SPREAD_RATIO = 0.25
 
 
 class Directions:
@@ -63,18 +63,18 @@ class Directions:
         NED needs several headings: a vehicle that yaws in waves on a straight course looks like NED.
         """
         of_body, of_enu, of_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
-        if of_enu < 1.0 - ALIKE and of_enu < CLEARLY * of_body:
+        if of_enu < 1.0 - MIN_RESULTANT and of_enu < MAX_SPREAD_RATIO * of_body:
             return True
-        return self._headings_are_several and of_ned < 1.0 - ALIKE and of_ned < CLEARLY * of_body
+        return self._headings_are_several and of_ned < 1.0 - MIN_RESULTANT and of_ned < MAX_SPREAD_RATIO * of_body
 
     @property
     def stay_in_the_body(self) -> bool:
         """True if the velocity direction is constant in the body over several headings."""
-        return self._headings_are_several and self._length(self._body) > ALIKE
+        return self._headings_are_several and self._length(self._body) > MIN_RESULTANT
 
     @property
     def _headings_are_several(self) -> bool:
-        return self._length(self._heading) < ALIKE
+        return self._length(self._heading) < MIN_RESULTANT
 
 
 # Largest misfit of a reported configuration, as a share of the speed and of the misfit of the configured one.
@@ -88,7 +88,7 @@ DRAWN = math.pi / 4.0
 SIGNS: Sequence[Array] = [np.array([1.0, one, other]) for one in (1.0, -1.0) for other in (1.0, -1.0)]
 SIGNS_OF_AHEAD: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
 # Largest residual of an explanation by signs, as a multiple of the registered one, whose clocks are free. In long
-# recordings it is smaller: a residual less by that factor is then enough for a delay (`GAIN`). FAR_WORSE: for few rows.
+# recordings it is smaller: a residual less by that factor is then enough for a delay (`LOG_GAIN`). FAR_WORSE: few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # Smallest excess factor of one axis, above any error of the speed of sound.
 SCALED_ALONE = 0.2
@@ -133,12 +133,12 @@ def fitting_configuration(
     if as_given < WRONG_FROM:
         assert given is not None
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
-        as_well = min(AS_WELL, math.exp(GAIN / (3.0 * max(independent, 1.0))))
+        as_well = min(AS_WELL, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
         return wrong_axes(motion, curves, nominal, lever_arm, as_well * given.spread, parameters.dvl_axes, SIGNS)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
-        fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
+        fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS)
         # mountings with a name, and a free one
         likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
         of_use = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
@@ -222,7 +222,7 @@ def wrong_axes(
     found: list[tuple[float, Array, Fitted]] = []
     for pattern in patterns:
         signs = pattern[np.argsort([ahead, *others])]
-        quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
+        quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), QUICK_ROWS)
         given_up = min([FAR_ABOVE * FAR_WORSE * most, *(level for level, *_ in found)])
         near = nearest(quick, nominal, (REFERENCE,), given_up)
         # a fit that rotates the axes back is the configured pattern
@@ -231,7 +231,7 @@ def wrong_axes(
     if not found:
         return None
     _, signs, near = min(found, key=lambda each: each[0])
-    fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
+    fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FULL_ROWS)
     fitted = fit(0.0, near.dvl_delay_s, nominal, (REFERENCE,))
     if fitted is None:
         return None

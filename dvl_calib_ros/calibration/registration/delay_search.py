@@ -18,16 +18,16 @@ from ..streams.interpolation import REACH_INTERVALS, attitude_at
 from .motion_streams import MotionStreams
 
 # Largest searched delay, s.
-LONGEST_S = 60.0
+FARTHEST_S = 60.0
 # Grid steps of short and long recordings, s, most steps of a short one, and most grid points: memory and time are
 # bounded, and turns of a vehicle last longer than a step.
-STEP_S, LONG_STEP_S, MANY, MOST = 0.5, 1.0, 500, 7200
+STEP_S, LONG_STEP_S, MAX_SHORT_STEPS, MAX_STEPS = 0.5, 1.0, 500, 7200
 # Gaps longer than both `REACH_INTERVALS` and this time (s) are not interpolated.
 HOLE_S = 2.5
 # Smallest overlap: share of the shorter stream, and seconds.
-OVERLAP, SHORTEST_S = 0.4, 20.0
+MIN_OVERLAP, MIN_OVERLAP_S = 0.4, 20.0
 # Smallest distance of two minima, s.
-APART_S = 2.0
+SEPARATION_S = 2.0
 
 
 class ClockPlace(NamedTuple):
@@ -73,22 +73,22 @@ def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> lis
             break
         place = ClockPlace(float(by_reference[r]), float(by_dvl[d]), float(misfit[r, d]))
         found.append(place)
-        near = np.abs(by_reference - place.reference)[:, None] < APART_S
-        misfit[near & (np.abs(by_dvl - place.dvl) < APART_S)] = np.inf
+        near = np.abs(by_reference - place.reference)[:, None] < SEPARATION_S
+        misfit[near & (np.abs(by_dvl - place.dvl) < SEPARATION_S)] = np.inf
     return found
 
 
 def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Array]:
     """Return delays (L,) s, and the misfit (L or 1, L) by reference delay and DVL delay."""
     step, grid = _grid(motion)
-    reach = round(LONGEST_S / step)
+    reach = round(FARTHEST_S / step)
     delays = step * np.arange(-reach, reach + 1)
     v = _on_grid(motion.dvl.times, motion.dvl.velocity, grid, step)
     g = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
     n = len(grid)
     size = 1 << (n + 2 * reach - 1).bit_length()
     of_v = np.fft.rfft(np.column_stack([v.values, v.known, v.squares]), size, axis=0)
-    least = max(OVERLAP * min(v.known.sum(), g.known.sum()), SHORTEST_S / step)
+    least = max(MIN_OVERLAP * min(v.known.sum(), g.known.sum()), MIN_OVERLAP_S / step)
     attitude: Array | None = None
     if motion.in_earth and motion.has_attitude:
         attitude, oriented = attitude_at(motion.imu, grid, HOLE_S)
@@ -125,8 +125,8 @@ def _grid(motion: MotionStreams) -> tuple[float, Array]:
     """Return step (s) and times (N,) s of the grid over all streams, cut off for long recordings."""
     times = [motion.dvl.times, motion.reference_times]
     start, end = min(t[0] for t in times), max(t[-1] for t in times)
-    step = STEP_S if end - start <= MANY * STEP_S else LONG_STEP_S
-    return step, start + step * np.arange(min(int((end - start) / step) + 1, MOST))
+    step = STEP_S if end - start <= MAX_SHORT_STEPS * STEP_S else LONG_STEP_S
+    return step, start + step * np.arange(min(int((end - start) / step) + 1, MAX_STEPS))
 
 
 def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:

@@ -34,29 +34,29 @@ from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import enu_from, quaternion_product
 from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from .configuration_check import BETTER_BY, DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
-from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
+from .gauss_newton import ARM, MIN_SPEED_MPS, QUICK_ROWS, REFERENCE, MotionFit, white_noise
 from .motion_streams import Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
 
 # Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a
 # vehicle that only moves ahead) and changes observable ones by less than 0.1 degrees.
-AS_IT_IS = 1e-3
+PRIOR_WEIGHT = 1e-3
 # Share of samples kept; the rest are outliers or lags in turns.
 KEPT_SHARE = 0.9
 # Largest residual of a reading that is preferred to the declared one, as a share of the speed (17 degrees of
 # misalignment); its largest ratio is `BETTER_BY`.
-FITS = 0.3
+MAX_RESIDUAL = 0.3
 # Largest residual ratio that justifies a rotation about the direction of travel.
-ROLLED = 0.8
+ROLL_RATIO = 0.8
 # Equivalent number of independent samples of a comparison, and smallest residual, as a share of the speed.
-INDEPENDENT, LEAST_RESIDUAL = 4.0, 0.005
+N_INDEPENDENT, MIN_RESIDUAL = 4.0, 0.005
 # Smallest mean sideways velocity of a vehicle that travels sideways, as a share of the speed.
-SIDEWAYS = 0.5
+MIN_SIDEWAYS = 0.5
 # Smallest RMS turn rate that determines the axes, rad/s.
-TURNS = 0.01
+MIN_TURN_RADPS = 0.01
 # Distance of roll, pitch, yaw (rad) from a drawn mounting (multiples of `DRAWN`) below which that mounting is meant.
 # The yaw is shown best, and 5 degrees off a mounting is rejected.
-MEANT_WITHIN = np.radians([8.0, 8.0, 4.0])
+NOMINAL_TOL_RAD = np.radians([8.0, 8.0, 4.0])
 
 
 # Body frames of a reference, and the matrix from each frame to body or ENU axes.
@@ -155,7 +155,7 @@ class Readings:
         self._motions: dict[Reading, MotionStreams] = {}
         self._fits: dict[Reading, MotionFit] = {}
         times, dvl = motion.dvl
-        use = covered(motion.reference_times, times) & (squared(dvl) > SLOW_MPS**2)
+        use = covered(motion.reference_times, times) & (squared(dvl) > MIN_SPEED_MPS**2)
         if motion.has_attitude:
             use &= attitude_at(motion.imu, times, GAP_S)[1]
         self._at, self._dvl = times[use], dvl[use]
@@ -173,14 +173,14 @@ class Readings:
     def log_likelihood(self, residual: float) -> float:
         """Return the tempered log likelihood of a residual share, corrected for the reference noise.
 
-        Errors by lever arms, delays and waves are correlated, so few samples count (`INDEPENDENT`).
+        Errors by lever arms, delays and waves are correlated, so few samples count (`N_INDEPENDENT`).
         """
         return self.log_likelihood_registered(self.without_noise(residual))
 
     @staticmethod
     def log_likelihood_registered(residual: float) -> float:
         """Return the tempered log likelihood of a registration residual, noise included."""
-        return -3.0 * INDEPENDENT * math.log(max(residual, LEAST_RESIDUAL))
+        return -3.0 * N_INDEPENDENT * math.log(max(residual, MIN_RESIDUAL))
 
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
         """Compare all possible readings with synchronised clocks. Return the best first.
@@ -211,7 +211,7 @@ class Readings:
             best_residual = _rms(dvl - body @ best.T) / speed
             residual = best_residual if known is None else _rms(dvl - body @ known.T) / speed
             travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
-            is_ahead = bool(travel[1] < max(travel[0], SIDEWAYS * speed))
+            is_ahead = bool(travel[1] < max(travel[0], MIN_SIDEWAYS * speed))
             found.append(Agreement(reading, residual, best, best_residual, is_ahead))
         # a small penalty prefers the smaller rotation; rounding makes ties stable (two inverted worlds fit equally)
         return sorted(found, key=lambda each: round(each.residual + (0.02 * each.angle if known is None else 0.0), 9))
@@ -260,7 +260,7 @@ class Readings:
         """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""
         travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
         least = least_turn(rotation_dvl_from_body.T @ travel, travel)
-        is_needed = ROLLED * self.agreements([found.reading], least)[0].residual > found.best_residual
+        is_needed = ROLL_RATIO * self.agreements([found.reading], least)[0].residual > found.best_residual
         return rotation_dvl_from_body if is_needed else least
 
     def is_in_body(self, found: Agreement) -> bool:
@@ -277,7 +277,7 @@ class Readings:
         """Return the least squares of a reading; None if a required attitude is missing."""
         motion = self._read(reading)
         if motion is not None and reading not in self._fits:
-            self._fits[reading] = MotionFit(motion, self._position, Curves(motion), FEW_ROWS)
+            self._fits[reading] = MotionFit(motion, self._position, Curves(motion), QUICK_ROWS)
         return self._fits.get(reading)
 
     def _read(self, reading: Reading) -> MotionStreams | None:
@@ -303,16 +303,16 @@ def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> b
     rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)
     use = np.isfinite(rates).all(axis=1) & np.isfinite(own).all(axis=1)
     rates, own = rates[use], own[use]
-    if len(own) < FEWEST_VALUES or _rms(own) < TURNS or _rms(rates) < TURNS:
+    if len(own) < FEWEST_VALUES or _rms(own) < MIN_TURN_RADPS or _rms(rates) < MIN_TURN_RADPS:
         return None
     left, right = _rms(own - rates), _rms(own @ FLU_FROM_FRD - rates)
     return None if min(left, right) > BETTER_BY * max(left, right) else right < left
 
 
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
-    """Return the rotation M (3, 3) from b (N, 3) to a (N, 3), with weight AS_IT_IS on the prior `as_it_is`."""
+    """Return the rotation M (3, 3) from b (N, 3) to a (N, 3), with weight PRIOR_WEIGHT on the prior `as_it_is`."""
     square = float(squared(b).mean())
-    return nearest_rotation(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
+    return nearest_rotation(a.T @ b / len(a) + PRIOR_WEIGHT * square * as_it_is)
 
 
 def least_turn(a: Array, b: Array) -> Array:
@@ -328,7 +328,7 @@ def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
     """Return the likely intended mounting (rad): the drawn angle if near (multiples of `DRAWN`), else whole degrees."""
     rpy = rpy_from_rotation(rotation_body_from_dvl)
     near = DRAWN * np.round(rpy / DRAWN)
-    meant = np.where(np.abs(rpy - near) < MEANT_WITHIN, near, whole_degrees(rotation_body_from_dvl))
+    meant = np.where(np.abs(rpy - near) < NOMINAL_TOL_RAD, near, whole_degrees(rotation_body_from_dvl))
     roll, pitch, yaw = (meant + 0.0).tolist()
     return roll, pitch, yaw
 

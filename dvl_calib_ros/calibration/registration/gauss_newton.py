@@ -35,26 +35,26 @@ BOTH_ALIKE: Array = np.array([0.0] * 7 + [1.0, 0.0])
 # σ of the constraint on a synchronised clock, s.
 HELD_STD_S = 1e-4
 # Prior σ of the states; it decides what the motion does not: at one speed a delay looks like a lever arm.
-LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
+PRIOR_STD: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
 # Most references in a full and in a quick fit, evenly spread.
-MOST_ROWS, FEW_ROWS = 4000, 800
+FULL_ROWS, QUICK_ROWS = 4000, 800
 # Most rounds, and the largest step (s, m, rad) of a converged fit.
-ROUNDS, SETTLED_S = 12, 5e-4
+ROUNDS, CONVERGED_STEP = 12, 5e-4
 # Largest delay step per round, s: the slopes are valid this far.
-FARTHEST_S = 0.7
+MAX_DELAY_STEP_S = 0.7
 # Round from which a fit is given up if its residual exceeds `most` and this share of the last one.
-ROUNDS_TO_FALL, HARDLY_LESS = 3, 0.9
+FAILED_AFTER, MIN_DECREASE = 3, 0.9
 # Residual in σ at which a sample has half the weight.
-HALF_AT = 3.0
+HALF_WEIGHT_Z = 3.0
 # Lowest compared reference speed, m/s.
-SLOW_MPS = 0.1
+MIN_SPEED_MPS = 0.1
 # Prior σ of an axis factor about 1, for factors that are not observable.
-WIDEST_FACTOR = 3.0
+FACTOR_STD = 3.0
 # Largest share of the information on δ that is attributed to DVL noise.
-MOST_OF_NOISE = 0.95
-# Time blocks that σ is estimated from, and the threshold for correlated noise (`block_covariance.LASTS`): high, so that
-# the residual of a clock change does not count as noise.
-BLOCKS, LASTS_BEYOND_DOUBT = 48, 2.5
+MAX_NOISE_SHARE = 0.95
+# Time blocks that σ is estimated from, and the threshold for correlated noise instead of `LASTING_Z`: high, so that the
+# residual of a clock change does not count as noise.
+BLOCKS, CLOCK_LASTING_Z = 48, 2.5
 _Compared = tuple[Index, tuple[Array, ...]]
 
 
@@ -164,12 +164,12 @@ class MotionFit:
     dvl_noise: variance of the DVL's white noise, (m/s)².
     """
 
-    def __init__(self, motion: MotionStreams, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
+    def __init__(self, motion: MotionStreams, lever_arm: Array, curves: Curves, most: int = FULL_ROWS) -> None:
         """Prepare a fit. lever_arm: (3,) m configured. curves: smoothed motion. most: most references used."""
         self._motion, self._lever_arm, self._curves = motion, lever_arm, curves
         self.is_turned = motion.in_earth and motion.has_attitude
         m = motion
-        moving = np.flatnonzero(squared(m.reference) >= SLOW_MPS**2)
+        moving = np.flatnonzero(squared(m.reference) >= MIN_SPEED_MPS**2)
         if len(moving) > most:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self.times, self._velocity = m.reference_times[moving], m.reference[moving]
@@ -212,15 +212,15 @@ class MotionFit:
                 return None
             solved = self._solved(x, rows, nominal, rotation, in_time)
             step, _, level, _ = solved
-            if number >= ROUNDS_TO_FALL and level > max(most, HARDLY_LESS * left):
+            if number >= FAILED_AFTER and level > max(most, MIN_DECREASE * left):
                 return None
             left = level
             far = float(np.abs(step[[DELTA, RHO]]).max())
-            step = step * min(1.0, FARTHEST_S / max(far, 1e-9))
+            step = step * min(1.0, MAX_DELAY_STEP_S / max(far, 1e-9))
             x = x + step
             rotation = rotation_of(step[TURN]) @ rotation
             x[TURN] = 0.0
-            if far < SETTLED_S and float(np.abs(step).max()) < SETTLED_S:
+            if far < CONVERGED_STEP and float(np.abs(step).max()) < CONVERGED_STEP:
                 break
         rows = self._rows(x, rotation, among)
         if rows is None or solved is None:
@@ -252,14 +252,14 @@ class MotionFit:
         if rows is None:
             return AxisFactors(np.ones(3), np.full(3, np.inf), fitted.level)
         axes = rows.residual.shape[1]
-        weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
+        weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_WEIGHT_Z**2 * axes * fitted.level**2))
         own = self._axes_of_dvl(fitted, rows, rotation)
         kept = [*range(N)[TURN], *range(N)[ARM], DELTA]
         h = np.concatenate([own, rows.jacobian[:, :, kept]], axis=2).reshape(-1, 3 + len(kept))
         w = np.repeat(weight, axes) / fitted.level**2
         from_prior = fitted.x.copy()
         from_prior[TURN], from_prior[DELTA] = turn_between(nominal, rotation), 0.0
-        prior = np.concatenate([np.full(3, WIDEST_FACTOR**-2.0), LIKELY[kept] ** -2.0])
+        prior = np.concatenate([np.full(3, FACTOR_STD**-2.0), PRIOR_STD[kept] ** -2.0])
         information = (h * w[:, None]).T @ h + np.diag(prior)
         vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[kept]])
         found = np.linalg.solve(information, vector)
@@ -355,15 +355,15 @@ class MotionFit:
         axes = rows.residual.shape[1]
         squares = squared(rows.residual)
         level2 = max(float(median(squares)) / chi2_isf(0.5, axes), 1e-8)
-        weight = 1.0 / (1.0 + squares / (HALF_AT**2 * axes * level2))
+        weight = 1.0 / (1.0 + squares / (HALF_WEIGHT_Z**2 * axes * level2))
         h = rows.jacobian.reshape(-1, N)
         w = np.repeat(weight, axes) / level2
-        prior = LIKELY**-2.0
+        prior = PRIOR_STD**-2.0
         weighted = (h * w[:, None]).T
         information = weighted @ h + np.diag(prior)
         # DVL noise in the slope counts as information on δ: subtract it, but less than the marginal information on δ
         marginal = 1.0 / float(np.linalg.inv(information)[DELTA, DELTA])
-        information[DELTA, DELTA] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * marginal)
+        information[DELTA, DELTA] -= min(float(weight @ rows.of_noise) / level2, MAX_NOISE_SHARE * marginal)
         from_prior = x.copy()
         from_prior[TURN] = turn_between(nominal, rotation)
         from_prior[[DELTA, RHO]] = 0.0
@@ -382,14 +382,14 @@ def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Cl
         h = rows.jacobian[part].reshape(-1, N)
         w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
         blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
-    factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT, None)
+    factor = blocks.inflation(0, np.zeros(N), p, CLOCK_LASTING_Z, None)
     inflation = max(float(factor[[DELTA, RHO]].max()), _lasting(rows.residual))
     return Claimed(p * np.outer(factor, factor), inflation, factor)
 
 
 def _robust(squares: Array, axes: int, level: float) -> Array:
     """Return squares (J,) (m/s)² over `axes` axes as chi-square at a noise level (m/s), logarithmic for outliers."""
-    scale = HALF_AT**2 * axes
+    scale = HALF_WEIGHT_Z**2 * axes
     return np.asarray(scale * np.log1p(squares / (scale * level**2)))
 
 

@@ -17,16 +17,16 @@ from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.tests import RULED_OUT, Z_FIFTY_TESTS
-from .clock_drift_and_jumps import MOST_STRETCHES, REPORTED_FROM_S, STRETCH_S, ClockChange, stamps, unsteady
-from .delay_search import LONGEST_S, places
+from .clock_drift_and_jumps import MAX_STRETCHES, REPORTED_FROM_S, STRETCH_S, ClockChange, stamps, unsteady
+from .delay_search import FARTHEST_S, places
 from .gauss_newton import (  # fmt: skip
     ARM,
     BOTH_ALIKE,
     DELTA,
     DVL,
-    FEW_ROWS,
+    FULL_ROWS,
     HELD_STD_S,
-    MOST_ROWS,
+    QUICK_ROWS,
     REFERENCE,
     RHO,
     SCALE,
@@ -38,39 +38,39 @@ from .gauss_newton import (  # fmt: skip
 from .motion_streams import Curves, MotionStreams
 
 # Chi-square that each additional delayed clock must gain.
-ONE_MORE = 12.0
+GAIN_PER_CLOCK = 12.0
 # Chi-square by which the next explanation must be worse for a refusal, if the σ of the calibration cover the delay. The
 # chi-square of the same streams varies this much with the selected samples.
-REFUSED_FROM = 16.0
+REFUSAL_CHI2 = 16.0
 # Chi-square that synchronised clocks may cost without a test of other explanations.
-NO_DOUBT = 3.0
+IN_SYNC_CHI2 = 3.0
 # Largest misfit of a candidate: this multiple of the smallest misfit, plus this share of the squares.
-WORSE = 3.0, 0.02
+MISFIT_LIMIT = 3.0, 0.02
 # Chi-square penalty of early stamps: processing makes stamps late, only a wrong clock makes them early.
-EARLY = 6.0
+EARLY_PENALTY = 6.0
 # Spacing of independent samples (s), and log evidence that a larger delay must gain over a smaller one.
-INDEPENDENT_S, GAIN = 1.0, 8.0
+INDEPENDENT_S, LOG_GAIN = 1.0, 8.0
 # If the best candidate compares fewer references than this share of another one, they are compared on shared ones.
-AS_MANY = 0.95
+MIN_ROW_SHARE = 0.95
 # σ inflation by correlated residuals from which a clock change is searched, and references per stretch of that search.
-STEADY, ROWS_OF_STRETCH = 1.05, 400
+STEADY_INFLATION, ROWS_OF_STRETCH = 1.05, 400
 # Largest σ of a known delay, s: the larger of a constant and a share of the delay, up to a maximum. A short recording
 # fits some delay of any clock to half a second.
-KNOWN_STD_S, KNOWN_SHARE, KNOWN_AT_MOST_S = 0.25, 0.12, 0.35
+KNOWN_STD_S, KNOWN_SHARE, KNOWN_MAX_S = 0.25, 0.12, 0.35
 
 
 OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
 # Smaller DVL delays are left to the calibration (full), which estimates them at any stamps, s.
-LEFT_TO_CALIBRATION_S = 2.5
+SMALL_DELAY_S = 2.5
 # Prior σ of the reference delay, s: receivers and filters have delays of tenths of a second.
-IN_TIME_STD_S = 0.5
+PRIOR_DELAY_STD_S = 0.5
 # From this many σ on, the fitted delay of a clock assumed synchronised becomes its σ. From this multiple of the prior σ
 # on, the sensitivities are those at zero delay.
-FAR_OPEN = 2.0
+OPEN_Z = 2.0
 # Smallest relevant lever arm uncertainty due to the reference clock, m (σ).
-OPEN_FROM_M = 0.03
+MIN_OPEN_M = 0.03
 # Smallest relevant DVL rotation uncertainty due to the reference clock, rad (σ).
-OPEN_FROM_RAD = math.radians(0.1)
+MIN_OPEN_RAD = math.radians(0.1)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Registration:
         """
         open_by = self.open_by * _with_prior(self.open_std_s)
         turn, arm = (float(np.linalg.norm(part)) for part in (open_by[:3], open_by[3:6]))
-        is_little = arm < OPEN_FROM_M and turn < OPEN_FROM_RAD
+        is_little = arm < MIN_OPEN_M and turn < MIN_OPEN_RAD
         return np.zeros((7, 7)) if is_little else np.outer(open_by, open_by)
 
     @property
@@ -144,7 +144,7 @@ class Registration:
     def corrections(self) -> dict[str, float]:
         """Delays (s) that a calibration corrects, by parameter; it estimates a small DVL delay itself."""
         found = {name: round(delay_s, 3) for name, delay_s in self.offsets.items()}
-        is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S
+        is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < SMALL_DELAY_S
         return {} if is_little else found
 
     def clock_reason(self, name: str) -> Reason:
@@ -168,7 +168,7 @@ class Registration:
         if self.unsteady is not None:
             return self.unsteady.reason(parameters.dvl_clock_drift)
         name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
-        if not clock.is_shown or (self.next_worse < REFUSED_FROM and self._holds(clock)):
+        if not clock.is_shown or (self.next_worse < REFUSAL_CHI2 and self._holds(clock)):
             return self.ambiguity
         offset = round(getattr(parameters, name) + clock.delay_s, 2)
         values = {"seconds": abs(clock.delay_s), "way": _way(clock), "parameter": name, "offset": offset}
@@ -178,12 +178,12 @@ class Registration:
 
     def _holds(self, clock: Clock) -> bool:
         """Return whether the σ of a calibration that assumes synchronisation cover the delay of a clock."""
-        return bool(self.left_open.any()) and abs(clock.delay_s) < FAR_OPEN * _with_prior(self.open_std_s)
+        return bool(self.left_open.any()) and abs(clock.delay_s) < OPEN_Z * _with_prior(self.open_std_s)
 
     @property
     def ambiguity(self) -> Reason | None:
         """Finding of a large relative delay whose clock is not identifiable, or None."""
-        if self.offsets or not self.apart.is_shown or abs(self.apart.delay_s) < LEFT_TO_CALIBRATION_S:
+        if self.offsets or not self.apart.is_shown or abs(self.apart.delay_s) < SMALL_DELAY_S:
             return None
         return finding("CLOCKS_NOT_TOLD_APART", seconds=abs(self.apart.delay_s), std=self.apart.std)
 
@@ -205,11 +205,11 @@ def _registered(
 ) -> Registration | None:
     """Register a motion. moves: clock change that is already corrected; None to search for one."""
     curves = Curves(motion)
-    fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
+    fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (FULL_ROWS, QUICK_ROWS))
     best = _placed(motion, quick, rotation_body_from_dvl)
     if best is None:
         return None
-    if moves is None and best.inflation > STEADY:
+    if moves is None and best.inflation > STEADY_INFLATION:
         moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
         if moves is not None:
             found = _registered(moves.corrected(motion), rotation_body_from_dvl, lever_arm, moves)
@@ -220,7 +220,7 @@ def _registered(
                 x[DELTA], x[RHO] = found.dvl.delay_s - found.reference.delay_s, found.reference.delay_s
                 return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
     in_time = _held(quick, best, rotation_body_from_dvl)
-    if in_time[1] < NO_DOUBT:  # the full fit would add no evidence
+    if in_time[1] < IN_SYNC_CHI2:  # the full fit would add no evidence
         seen = _explained(quick, best, in_time, rotation_body_from_dvl, lever_arm)
         if not seen.left_open.any():
             return seen
@@ -228,7 +228,7 @@ def _registered(
         free = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
         if free is None or not _is_possible(free):
             return seen
-        if _held(fit, free, rotation_body_from_dvl)[1] < NO_DOUBT:
+        if _held(fit, free, rotation_body_from_dvl)[1] < IN_SYNC_CHI2:
             return replace(seen, **_open(fit, free, 0.0, rotation_body_from_dvl))
         best = free
     best = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
@@ -240,7 +240,7 @@ def _registered(
 def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> Fitted | None:
     """Return the fit at the likeliest delays of a motion."""
     likely = places(motion, rotation)
-    enough = WORSE[0] * likely[0].misfit + WORSE[1] if likely else 0.0
+    enough = MISFIT_LIMIT[0] * likely[0].misfit + MISFIT_LIMIT[1] if likely else 0.0
     tried = [(place.reference, place.dvl - place.reference) for place in likely if place.misfit <= enough]
     found = [quick(*place, rotation) for place in {*tried, (0.0, 0.0)}]
     fitted = [each for each in found if each is not None and _is_possible(each)]
@@ -255,10 +255,10 @@ def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> 
 def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
     """Return the clock drift or step between the stretches of a motion, or None."""
     times = motion.reference_times
-    number = min(int((times[-1] - times[0]) / STRETCH_S), MOST_STRETCHES)
+    number = min(int((times[-1] - times[0]) / STRETCH_S), MAX_STRETCHES)
     found = []
     for at in np.array_split(np.arange(len(times)), max(number, 1)) if number > 1 else ():
-        own = motion.part(at, LONGEST_S)
+        own = motion.part(at, FARTHEST_S)
         best = _placed(own, MotionFit(own, lever_arm, curves, ROWS_OF_STRETCH), rotation)
         if best is not None:
             found.append((float(times[at].mean()), best))
@@ -271,18 +271,18 @@ def _explained(
 ) -> Registration:
     """Explain a fit by the fewest delayed clocks: none (in_time, see `_held`), one of three, or DVL and reference."""
     apart = float(free.x[DELTA])
-    early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
+    early, too_early = (EARLY_PENALTY, 0.0) if apart < 0.0 else (0.0, EARLY_PENALTY)
     tried = {_Off.NONE: in_time}
-    if tried[_Off.NONE][1] >= NO_DOUBT:
+    if tried[_Off.NONE][1] >= IN_SYNC_CHI2:
         tried |= {
-            _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), ONE_MORE + early),
-            _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), ONE_MORE + too_early),
-            _Off.IMU: _held(fit, free, rotation, float(free.x[RHO]), 0.0, (BOTH_ALIKE,), ONE_MORE),
+            _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), GAIN_PER_CLOCK + early),
+            _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), GAIN_PER_CLOCK + too_early),
+            _Off.IMU: _held(fit, free, rotation, float(free.x[RHO]), 0.0, (BOTH_ALIKE,), GAIN_PER_CLOCK),
         }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
     # BOTH includes every other explanation, so it is no alternative
     next_worse = min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost
-    if best is None or cost > 2.0 * ONE_MORE:
+    if best is None or cost > 2.0 * GAIN_PER_CLOCK:
         likeliest, best, next_worse = _Off.BOTH, free, math.inf
     is_identified = next_worse > RULED_OUT
     x, p = best.x, best.p
@@ -316,18 +316,18 @@ def _open(fit: MotionFit, free: Fitted, delay_s: float, rotation: Array | None) 
     if not fit.is_turned:
         return {"open_std_s": 0.0, "open_by": np.zeros(7)}
     std, by, off = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
-    if off > FAR_OPEN * std and delay_s == 0.0:
+    if off > OPEN_Z * std and delay_s == 0.0:
         std = off
-    if off > FAR_OPEN * IN_TIME_STD_S and delay_s == 0.0:
+    if off > OPEN_Z * PRIOR_DELAY_STD_S and delay_s == 0.0:
         # the free delay is so large that its sensitivities do not hold at zero delay
-        near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
+        near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / PRIOR_DELAY_STD_S),))
         std, by = max(std, off), by if near is None else near.by(RHO)
     return {"open_std_s": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[DELTA]]])}
 
 
 def _with_prior(std: float) -> float:
     """Return σ (s) of the reference delay, prior included, from its σ by the data alone."""
-    return 1.0 / math.hypot(1.0 / max(std, 1e-9), 1.0 / IN_TIME_STD_S)
+    return 1.0 / math.hypot(1.0 / max(std, 1e-9), 1.0 / PRIOR_DELAY_STD_S)
 
 
 class _Off(Enum):
@@ -364,14 +364,14 @@ def _is_off(fitted: Fitted, index: int) -> bool:
 
 def is_beyond_doubt(seconds: float, std: float) -> bool:
     """Return whether a delay (s) with this σ (s) is significant and large enough to report."""
-    is_known = std < min(max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds)), KNOWN_AT_MOST_S)
+    is_known = std < min(max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds)), KNOWN_MAX_S)
     return is_known and abs(seconds) > max(REPORTED_FROM_S, Z_FIFTY_TESTS * std)
 
 
 def _is_possible(fitted: Fitted) -> bool:
     """Return whether the fitted delays are finite and within the search range."""
     delays_s = [fitted.x[RHO], fitted.dvl_delay_s]
-    return bool(np.isfinite(fitted.x).all() and np.abs(delays_s).max() <= LONGEST_S)
+    return bool(np.isfinite(fitted.x).all() and np.abs(delays_s).max() <= FARTHEST_S)
 
 
 def _way(clock: Clock) -> str:
@@ -385,10 +385,10 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fit
     sample other DVL noise; in periodic waves this alone makes a difference.
     """
     is_read_elsewhere = abs(float(one.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
-    enough = GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
+    enough = LOG_GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
     if _gain(motion, one, closest) < enough:
         return True
-    if closest.rows > AS_MANY * one.rows:
+    if closest.rows > MIN_ROW_SHARE * one.rows:
         return False
     again = fit(float(one.x[RHO]), float(one.x[DELTA]), rotation, (), closest)
     if again is None:

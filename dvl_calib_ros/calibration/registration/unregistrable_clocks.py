@@ -1,6 +1,6 @@
 """Detection of clock offsets beyond the search range, by correlation over the whole recording.
 
-Offsets up to `LONGEST_S` are registered. Beyond, a registration would settle at a wrong delay, so the data are refused.
+Offsets up to `FARTHEST_S` are registered. Beyond, a registration would find a wrong delay, so the data are refused.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..streams.interpolation import attitude_at, shortened
-from .delay_search import HOLE_S, LONGEST_S, OVERLAP, STEP_S
+from .delay_search import FARTHEST_S, HOLE_S, MIN_OVERLAP, STEP_S
 from .motion_streams import MotionStreams
 
 # Largest share of the squared residual at the best near delay that a far delay may leave. Repeated legs agree to a
 # half.
-BELIEVED = 0.25
+MAX_SQUARE_SHARE = 0.25
 # Smallest overlap, s.
-FEWEST_S = 60.0
+SHORTEST_OVERLAP_S = 60.0
 # Longest series, s, or steps per sample: memory must not grow with pauses.
 LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE = 86_400.0, 16
 # Width of the running median that removes spikes of the speed, steps.
@@ -44,7 +44,7 @@ class UnregistrableClocks(NamedTuple):
         """Finding that names the clock."""
         way = "later" if self.delay_s > 0.0 else "earlier"
         return finding(
-            "CLOCK_FAR", whose=self.whose, seconds=abs(self.delay_s), way=way, others=self.others, limit=LONGEST_S
+            "CLOCK_FAR", whose=self.whose, seconds=abs(self.delay_s), way=way, others=self.others, limit=FARTHEST_S
         )
 
 
@@ -138,7 +138,7 @@ def lag(
     weight: Array | None = None,
     own: Array | None = None,
 ) -> tuple[float, bool]:
-    """Return the delay (s) of a series relative to another, and whether it surely exceeds LONGEST_S.
+    """Return the delay (s) of a series relative to another, and whether it surely exceeds FARTHEST_S.
 
     The delay minimises the mean squared difference; it must be clearly better than none, a far one than all near ones.
 
@@ -163,15 +163,15 @@ def lag(
         count = correlated(own, weight)
         squares = correlated(own * np.abs(one) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
         squares -= 2.0 * correlated(own * one, weight * other)
-        enough = count >= max(OVERLAP * min(float(n), float(weight.sum())), FEWEST_S / STEP_S)
+        enough = count >= max(MIN_OVERLAP * min(float(n), float(weight.sum())), SHORTEST_OVERLAP_S / STEP_S)
         return np.where(enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
 
     mean = means(weight)
     delays = one_start - other_start + STEP_S * np.arange(-(m - 1), n)
-    near = np.abs(delays) <= LONGEST_S + STEP_S
+    near = np.abs(delays) <= FARTHEST_S + STEP_S
     best = int(np.argmin(mean))
     nearest = float(mean[near].min()) if near.any() else np.inf
-    if not near[best] and mean[best] < BELIEVED * nearest:
+    if not near[best] and mean[best] < MAX_SQUARE_SHARE * nearest:
         # compare on the same samples: a noisy stretch may be outside the overlap of the far delay
         index = np.arange(m) + best - (m - 1)
         overlap = np.where((index >= 0) & (index < n), weight, 0.0)
@@ -179,11 +179,11 @@ def lag(
         # periodic motion may agree at far lags, but it then agrees at near lags, too, to the change within one step
         both = weight[1:] * weight[:-1]
         of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
-        if mean[best] < BELIEVED * nearest and nearest > of_a_step:
+        if mean[best] < MAX_SQUARE_SHARE * nearest and nearest > of_a_step:
             # repeated legs agree at several lags: take the smallest
             as_good = np.where(mean <= 1.5 * mean[best], np.abs(delays), np.inf)
             return float(delays[int(np.argmin(as_good))]), True
     best = int(np.argmin(np.where(near, mean, np.inf)))
     # a nearly constant speed agrees as well at any lag
-    is_better = near[best] and mean[best] < BELIEVED * mean[int(np.argmin(np.abs(delays)))]
+    is_better = near[best] and mean[best] < MAX_SQUARE_SHARE * mean[int(np.argmin(np.abs(delays)))]
     return float(delays[best]) if is_better else 0.0, False

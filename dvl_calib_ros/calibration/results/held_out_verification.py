@@ -28,15 +28,15 @@ from .results import Verification
 # hand (0.5°) has.
 ACCEPTED_DRIFT = 5.0
 # Significant growth of the squared error in variances of the estimate, for the three angles at least.
-WORSE_FROM = chi2_isf(CHANCE, 3) / 3.0
+WORSE_VARIANCES = chi2_isf(CHANCE, 3) / 3.0
 # Held-out error in predicted errors that slightly small claims of noise do not explain.
-SEVERAL = 3.0
+MAX_ERROR_RATIO = 3.0
 # Smallest plausible held-out error as a share of the claimed noise: below, reference and DVL share their noise.
-IMPLAUSIBLE = 0.2
+MIN_ERROR_RATIO = 0.2
 # Largest share of gated samples: above, the estimate is that of a minority.
-MOST_GATED = 0.5
+MAX_GATED = 0.5
 # Largest error without outliers in predicted errors; smallest error with outliers in errors without.
-AS_PREDICTED, MADE_BY_OUTLIERS = 1.25, 1.5
+AS_PREDICTED, OUTLIER_RATIO = 1.25, 1.5
 
 
 def verify(
@@ -94,7 +94,7 @@ def use_findings(used_and_gated: tuple[int, int] | None) -> list[Reason]:
     used, gated = used_and_gated
     if not used:
         return [finding("NO_SAMPLE_USED")]
-    if gated > MOST_GATED * (used + gated):
+    if gated > MAX_GATED * (used + gated):
         return [finding("MOST_SAMPLES_GATED", gated=gated, given=used + gated, used=used)]
     return []
 
@@ -173,20 +173,20 @@ def _error_finding(
     # if there is nothing to correct, a correction adds about the variance of the estimate; correlated noise makes this
     # more than the filter predicts, so a larger error is no contradiction
     worse = corrected**2 - uncorrected**2
-    is_large = corrected > SEVERAL * predicted
-    is_worse = worse - held_out.interpolated**2 > WORSE_FROM * max(held_out.calibration, own_error) ** 2
+    is_large = corrected > MAX_ERROR_RATIO * predicted
+    is_worse = worse - held_out.interpolated**2 > WORSE_VARIANCES * max(held_out.calibration, own_error) ** 2
     if typical_error is not None and (is_large or is_worse):
         # outliers make this comparison meaningless
-        as_usual = typical_error < (SEVERAL if is_large else AS_PREDICTED) * predicted
-        if as_usual and corrected > MADE_BY_OUTLIERS * typical_error:
+        as_usual = typical_error < (MAX_ERROR_RATIO if is_large else AS_PREDICTED) * predicted
+        if as_usual and corrected > OUTLIER_RATIO * typical_error:
             return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
     if is_worse:
         return finding("HELD_OUT_WORSE", **said)
     if is_large:
         return finding("HELD_OUT_SEVERAL_TIMES", **said)
-    if reference_claims and corrected < IMPLAUSIBLE * (expected := max(predicted, held_out.claimed)):
+    if reference_claims and corrected < MIN_ERROR_RATIO * (expected := max(predicted, held_out.claimed)):
         return finding("HELD_OUT_IMPLAUSIBLE", **said | {"predicted": expected})
-    if worse > WORSE_FROM * held_out.calibration**2:
+    if worse > WORSE_VARIANCES * held_out.calibration**2:
         return finding("HELD_OUT_NO_BETTER", **said)
     dof = 3.0 * (held_out.samples if held_out.independent is None else held_out.independent)
     by_chance = math.sqrt(chi2_isf(CHANCE, dof) / dof)

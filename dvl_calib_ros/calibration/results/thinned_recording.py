@@ -19,7 +19,7 @@ from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, at
 # Shortest interval of thinned samples, s: five per second suffice for a velocity error.
 KEPT_EVERY_S = 0.19
 # Size of an outlier in root median squared errors.
-OUTLYING = 5.0
+OUTLIER_RATIO = 5.0
 # Variance of an axis that is not measured, and the limit below which an axis is measured, (m/s)²
 NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
 
@@ -65,7 +65,7 @@ def without_outliers(error: Array) -> float | None:
     square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
     if not len(square):
         return None
-    good = square[square <= OUTLYING**2 * median(square)]
+    good = square[square <= OUTLIER_RATIO**2 * median(square)]
     return math.sqrt(float(good.mean()))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...calibration.registration.registration import IN_TIME_STD_S
+from ...calibration.registration.registration import PRIOR_DELAY_STD_S
 from ...effects.base import Effect
 from ..fit.cross_validation import predictive_gain_of
 from ..fit.gauss_newton import Z_INTERVAL, Fit, Fitter, n_amplitudes
@@ -85,7 +85,7 @@ def identify_effects(
     if clocks:
         selected = [_with_equivalents(each, clocks) if each.effect.name == ARM else each for each in selected]
     if trade_off and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
-        trade_off = replace(trade_off, delay_std_s=IN_TIME_STD_S)  # only their combination is observable
+        trade_off = replace(trade_off, delay_std_s=PRIOR_DELAY_STD_S)  # only their combination is observable
     if trade_off is not None:  # a lag differs from a delay by less than interpolation errors
         selected = [
             _with_equivalents(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each

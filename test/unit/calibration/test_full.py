@@ -18,7 +18,7 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.own import DELAY
 from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.block_covariance import MOST, TimeBlocks
+from dvl_calib_ros.calibration.numerics.block_covariance import MAX_BLOCKS, TimeBlocks
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -514,6 +514,6 @@ def test_blocks_of_time_are_joined_so_that_memory_is_bounded():
     blocks = TimeBlocks()
     for index in range(5000):
         blocks.add(np.full((1, 1, 1), 1.0), np.full((1, 1), float(index)), 2.0)
-    assert blocks.count <= MOST
+    assert blocks.count <= MAX_BLOCKS
     assert blocks.kept[0].sum() == 5000.0
     assert blocks.weight == 10000.0

@@ -13,7 +13,7 @@ from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, 
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.registration import registration
 from dvl_calib_ros.calibration.registration.configuration_check import SIGNS, fitting_configuration, wrong_axes
-from dvl_calib_ros.calibration.registration.delay_search import LONGEST_S, _minima, places
+from dvl_calib_ros.calibration.registration.delay_search import FARTHEST_S, _minima, places
 from dvl_calib_ros.calibration.registration.gauss_newton import (
     DELTA,
     DVL,
@@ -199,7 +199,7 @@ def test_nothing_is_taken_off_where_a_leg_does_not_show_its_clocks(seed):
     found = register(leg_in_moving_water(0.3, seed), np.eye(3), np.zeros(3))
     assert found is not None
     assert not found.are_known and found.corrections == {}
-    assert max(abs(found.dvl.delay_s), abs(found.reference.delay_s)) <= LONGEST_S
+    assert max(abs(found.dvl.delay_s), abs(found.reference.delay_s)) <= FARTHEST_S
 
 
 @pytest.mark.slow
@@ -383,12 +383,12 @@ def test_what_noise_seems_to_tell_of_a_delay_leaves_a_covariance(seed):
     made = make_motion((times, v), (times[::10], g[::10]), True, (True,) * 3, ImuColumns(times, attitude, rates))
     for in_time in ((), (REFERENCE,), (DVL,)):
         found = MotionFit(made, np.zeros(3), Curves(made))(0.0, 0.0, np.eye(3), in_time)
-        assert (np.diag(found.p) > 0.0).all() and np.abs(found.x).max() < LONGEST_S
+        assert (np.diag(found.p) > 0.0).all() and np.abs(found.x).max() < FARTHEST_S
 
 
 @pytest.mark.parametrize(
     ("at", "value", "is_possible"),
-    [(RHO, 0.0, True), (RHO, LONGEST_S - 1.0, True), (RHO, LONGEST_S + 1.0, False), (DELTA, LONGEST_S + 1.0, False),
+    [(RHO, 0.0, True), (RHO, FARTHEST_S - 1.0, True), (RHO, FARTHEST_S + 1.0, False), (DELTA, FARTHEST_S + 1.0, False),
      (DELTA, np.nan, False), (0, np.inf, False)],
 )  # fmt: skip
 def test_a_fit_that_settles_beyond_a_minute_or_nowhere_is_none(at, value, is_possible):

@@ -8,7 +8,7 @@ import pytest
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.block_estimator import FullEstimator
 from dvl_calib_ros.calibration.estimators.full_fit import KEPT_BLOCKS
-from dvl_calib_ros.calibration.estimators.registration_schedule import MOST_OF_A_BLOCK, KeptClocks
+from dvl_calib_ros.calibration.estimators.registration_schedule import ROWS_PER_BLOCK, KeptClocks
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.numerics.tables import RowTable, column
@@ -88,7 +88,7 @@ def test_what_is_registered_live_is_of_the_newest_blocks_in_memory_that_is_taken
     clocks = KeptClocks(Parameters(), live=True)
     streams = clocks._seen._streams
     memory = [stream.times for stream in streams]
-    n = MOST_OF_A_BLOCK
+    n = ROWS_PER_BLOCK
     for number in range(2 * KEPT_BLOCKS + 20):
         times = 10.0 * number + KEPT_EVERY_S * np.arange(n)
         reference = ReferenceColumns(times, np.ones((n, 3)), np.ones((n, 1, 1)) * np.eye(3), times < 0.0, times > 0.0)
