@@ -345,9 +345,9 @@ class Calibrator:
         return counted(self._aligner, self.selection.gnss.losses, self.restarts, restarted)
 
     @property
-    def reason_of_refusal(self) -> Mapping[str, set[str]]:
+    def refusal_counters(self) -> Mapping[str, set[str]]:
         """Names of the counters that hold refused messages, by stream."""
-        return self._aligner.reason_of_refusal
+        return self._aligner.refusal_counters
 
     @property
     def first_ns(self) -> int | None:

@@ -57,8 +57,6 @@ POWER = 0.8
 MIN_CLOSURE = 0.2
 # Least closure of an explanation; less is a part of one (issue 46)
 FULL_CLOSURE = 0.8
-# Least ratio of the unexplained error to the noise that is worth a mention, and no "no gap"
-REPORTED_LEFT_SHARE = 0.3
 
 
 def diagnose(
@@ -247,8 +245,7 @@ def _verdict(selection: EffectSelection, unexplained: Unexplained, gap: Gap, vis
         return DiagnosisVerdict.AMBIGUOUS if ambiguous else DiagnosisVerdict.KNOWN
     if visible_share < MIN_VISIBLE_SHARE:
         return DiagnosisVerdict.INSUFFICIENT_EXCITATION
-    is_left = gap.not_explained > REPORTED_LEFT_SHARE * gap.noise_floor
-    return DiagnosisVerdict.UNKNOWN if is_left else DiagnosisVerdict.NO_GAP
+    return DiagnosisVerdict.UNKNOWN if gap.is_reported else DiagnosisVerdict.NO_GAP
 
 
 def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: int) -> dict[str, float]:
@@ -391,10 +388,9 @@ def _reasons(
         "tested": n_tested,
     }
     is_unknown = verdict is DiagnosisVerdict.UNKNOWN
-    is_left = bool(found) and gap.not_explained > REPORTED_LEFT_SHARE * gap.noise_floor
     code = "GAP_PARTLY_UNKNOWN" if is_unknown and found else CODES[verdict]
     reasons = [finding(code, **numbers)]
-    if is_left:
+    if found and gap.is_reported:
         reasons.append(finding("REST_UNEXPLAINED", rest=1e3 * gap.not_explained))
     if is_unknown:
         reasons.append(unexplained.follows if unexplained.found else finding("REST_FOLLOWS_NOTHING"))

@@ -39,7 +39,7 @@ from . import topic_choice
 from .axis_signs import sign_findings
 from .clock_offsets import compared_motion, difference_of, on_imu_clock
 from .discovery import Discovery, Given, as_option, clocks_of_recording, in_time_of, mounting_guessed
-from .frame_choice import FrameChoice, FrameChooser, declared_reference
+from .frame_choice import AXES, FrameChoice, FrameChooser, declared_reference
 from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed, in_degrees, in_metres
 
@@ -231,8 +231,7 @@ class _Search:
             VELOCITY_TYPES[dvl.msgtype], dvl.frame_id, parameters
         ):
             axes = self._values["dvl_axes"] = FRD if is_turned != self._is_z_down else FLU
-            which = "forward-right-down" if axes == FRD else "forward-left-up"
-            self._found.append(f"the DVL's data are used as {which} (dvl_axes {axes})")
+            self._found.append(f"the DVL's data are used as {AXES[axes]} (dvl_axes {axes})")
         if known is not None and not self._is_given("mounting_rpy"):
             self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
         if placed is not None and placed.source:

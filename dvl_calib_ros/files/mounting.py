@@ -148,9 +148,9 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     errors = model.error_terms_from_state @ state.x
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
     arm, position = lever_arm(model, state, parameters.lever_arm), position_in_body(model, state, parameters)
-    local_copy = {"lever_arm": arm, "position": position}
+    from_states = {"lever_arm": arm, "position": position}
     agree = all(
-        np.allclose(in_result[name], local_copy[name] or in_result[name], rtol=0.0, atol=1e-6) for name in in_result
+        np.allclose(in_result[name], from_states[name] or in_result[name], rtol=0.0, atol=1e-6) for name in in_result
     )
     if not (angle_between(rotation, saved) < 1e-6 and agree):
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")

@@ -108,7 +108,7 @@ class Silence:
         """Return the fault of each faulty stream. counts: the calibrator's current ones."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
-            lost = _NOT_TAKEN | calibrator.reason_of_refusal[stream]
+            lost = _NOT_TAKEN | calibrator.refusal_counters[stream]
             used = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
             before = self._seen.get(stream)
             if before is None or before.taken != used:

@@ -67,13 +67,13 @@ class SimulatorNode(AnsweringNode):
         profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.RELIABLE)
         self._dvl = self.create_publisher(kind, outputs.dvl, profile)
         self._gnss = self.create_publisher(TwistWithCovarianceStamped, outputs.gnss, profile)
-        self._imu_message = self.create_publisher(Imu, outputs.imu, profile)
+        self._imu = self.create_publisher(Imu, outputs.imu, profile)
         self.sent = 0
 
     @property
     def is_heard(self) -> bool:
         """Return whether every topic has a subscriber."""
-        return all(each.get_subscription_count() > 0 for each in (self._dvl, self._gnss, self._imu_message))
+        return all(each.get_subscription_count() > 0 for each in (self._dvl, self._gnss, self._imu))
 
     def publish(self, samples: Sequence[Sample]) -> None:
         """Publish samples, in order."""
@@ -85,12 +85,12 @@ class SimulatorNode(AnsweringNode):
                     fill(TwistWithCovarianceStamped(), VELOCITY_TYPES[TWIST_TYPE], sample, FRAME_IDS[sample.frame])
                 )
             else:
-                self._imu_message.publish(_imu_message(sample))
+                self._imu.publish(_imu_message(sample))
             self.sent += 1
 
     def finish(self) -> None:
         """Wait until subscribers have received all messages."""
-        for each in (self._dvl, self._gnss, self._imu_message):
+        for each in (self._dvl, self._gnss, self._imu):
             each.wait_for_all_acked(PATIENCE)
 
     def follow(self, topic: str, scenario: Scenario) -> None:

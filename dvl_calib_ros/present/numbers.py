@@ -72,10 +72,10 @@ _SMALL = {"s": (1e3, "ms"), "m/s": (1e3, "mm/s"), "s/h": (1e3, "ms/h")}
 
 def quantity(values: Sequence[float], unit: str) -> tuple[list[float], str]:
     """Convert values to a displayed unit: degrees, ms and mm/s for rad, s and m/s."""
-    factor, display_name = _SPOKEN.get(unit, (1.0, unit))
-    if display_name in _SMALL and 0.0 < max((abs(each) for each in values if math.isfinite(each)), default=0.0) < 1.0:
-        factor, display_name = _SMALL[display_name]
-    return [factor * each for each in values], display_name
+    factor, unit_shown = _SPOKEN.get(unit, (1.0, unit))
+    if unit_shown in _SMALL and 0.0 < max((abs(each) for each in values if math.isfinite(each)), default=0.0) < 1.0:
+        factor, unit_shown = _SMALL[unit_shown]
+    return [factor * each for each in values], unit_shown
 
 
 def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffect | None = None) -> str:

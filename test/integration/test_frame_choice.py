@@ -89,15 +89,20 @@ def test_a_twist_is_in_the_axes_in_which_it_moves_its_own_pose(tmp_path, twist):
     assert said == (twist != "as its child frame says")
 
 
-@pytest.mark.spread(1)
-def test_a_forward_left_up_twist_of_a_vehicle_that_is_z_down_is_turned(tmp_path):
-    """It was no hypothesis: accepted with pitch and yaw of the opposite signs."""
+def z_down_with_a_twist_forward_left_up(folder, lever_arm, pose):
     told = Told()
     told.dvl("/dvl", TWIST, "dvl_link", frd=True)
     told.imu("/imu", "base_link", FLU_FROM_FRD, "ned")
-    odometry(told, np.eye(3), pose=True)
-    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), FLU_FROM_FRD @ np.array(LEVER_ARM)))
-    calibration = replay(told.write(tmp_path / "bag"))
+    odometry(told, np.eye(3), pose=pose)
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), lever_arm))
+    return told.write(folder / "bag")
+
+
+@pytest.mark.spread(1)
+def test_a_forward_left_up_twist_of_a_vehicle_that_is_z_down_is_turned(tmp_path):
+    """It was no hypothesis: accepted with pitch and yaw of the opposite signs."""
+    arm = FLU_FROM_FRD @ np.array(LEVER_ARM)
+    calibration = replay(z_down_with_a_twist_forward_left_up(tmp_path, arm, pose=True))
     parameters = calibration.replayed.result.parameters
     assert parameters["base_axes"] == "frd" and parameters["gnss_frame"] == "flu"
     assert is_right(calibration, truth_deg() * [1.0, -1.0, -1.0])
@@ -106,12 +111,7 @@ def test_a_forward_left_up_twist_of_a_vehicle_that_is_z_down_is_turned(tmp_path)
 @pytest.mark.spread(1)
 def test_a_twist_without_a_pose_leaves_open_whether_the_vehicle_is_z_down(tmp_path):
     """It was accepted with pitch and yaw of the opposite signs."""
-    told = Told()
-    told.dvl("/dvl", TWIST, "dvl_link", frd=True)
-    told.imu("/imu", "base_link", FLU_FROM_FRD, "ned")
-    odometry(told, np.eye(3), pose=False)
-    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    bag = told.write(tmp_path / "bag")
+    bag = z_down_with_a_twist_forward_left_up(tmp_path, (0.0, 0.0, 0.0), pose=False)
     found = replay(bag)
     assert found.verdict == "marginal" and doctor(bag).verdict == "partly"
     (open_,) = [each for each in found.discovery.contradictions if each.code == "FRAMES_AMBIGUOUS"]

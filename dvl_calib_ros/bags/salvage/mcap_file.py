@@ -354,8 +354,8 @@ class _FileWalk:
         is_message = likeness(head, self._size - at, self._tables) >= ALL_BUT_OPCODE and bool(self._tables.eras)
         # an index after a chunk resembles a message except for the opcode
         is_index = self._holds_chunks and is_message and _INDEX_HEAD.unpack_from(head)[-1] == length - _INDEX_OWN
-        is_other = opcode in (SCHEMA, CHANNEL) and is_definition(self._file, at, opcode, length)
-        if is_message and (opcode == MESSAGE) == is_index and not is_other:
+        resembles_another = is_message and (opcode == MESSAGE) == is_index
+        if resembles_another and not (opcode in (SCHEMA, CHANNEL) and is_definition(self._file, at, opcode, length)):
             raise DamagedError(f"the record at byte {at} is damaged")
         self.has_ended = is_end
         if is_end and opcode == Opcode.FOOTER:  # the end of the data is damaged

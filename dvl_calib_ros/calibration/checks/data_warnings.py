@@ -18,7 +18,7 @@ SUSPICIOUS_GATED = 0.2
 # or turn rate, such as those before the IMU's first, that changes no answer.
 SUSPICIOUS_REPEATED, UNIMPORTANT_SHARE = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
-MAX_OFFSETS = 4.0
+MAX_OFFSET_RATIO = 4.0
 # Share of the reference error that yaw absorbs, above which the two are not separable.
 INSEPARABLE_SHARE = 0.6
 # Uncertainty due to a clock offset that is reported: delay (s), yaw (°); a lever arm from `TAPE_STD_M`.
@@ -112,7 +112,7 @@ def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: floa
     yaw_by_offset = np.linalg.solve(p[np.ix_(at, at)], p[at, :3] @ turn)
     if float(np.linalg.norm(yaw_by_offset)) * speed < INSEPARABLE_SHARE:
         return []
-    off = MAX_OFFSETS * assumed
+    off = MAX_OFFSET_RATIO * assumed
     share = off / speed
     return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
 

@@ -152,7 +152,7 @@ class JointFit:
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
         self._slow, self._deviation, self._log_prior = self._points()
         self._known: dict[tuple[int | None, int | None, bool, int], _Hypotheses] = {}
-        self.used = self._gated = 0
+        self.used = self.gated = 0
         self._misfit = 0.0
         self._fitted: JointEstimate | None = None
         self._without: tuple[JointEstimate | None, list[list[GaussianState]]] | None = None
@@ -193,7 +193,7 @@ class JointFit:
     def add(self, block: FitBlock) -> None:
         """Take the next block. Raise numpy.linalg.LinAlgError and keep the earlier fit if numbers diverge."""
         day = self._days[-1]
-        state = self._x.copy(), self._fitted, self.used, self._gated, self._misfit
+        state = self._x.copy(), self._fitted, self.used, self.gated, self._misfit
         kept = [(each, replace(each, blocks=[*each.blocks], sections=[*each.sections])) for each in self._days]
         try:
             self._add(day, block)
@@ -201,7 +201,7 @@ class JointFit:
             if not all(np.isfinite(value).all() for value in self._fitted.state):
                 raise np.linalg.LinAlgError("numbers that ran away")
         except np.linalg.LinAlgError:
-            self._x, self._fitted, self.used, self._gated, self._misfit = state
+            self._x, self._fitted, self.used, self.gated, self._misfit = state
             self._days = [before for _, before in kept]
             raise
 
@@ -230,11 +230,6 @@ class JointFit:
             more[: len(x), : len(x)] = p
             more[len(x) :, len(x) :] = self._unknown.p[np.ix_(OF_DAY, OF_DAY)]
             self._fitted = self._fitted._replace(state=GaussianState(self._x.copy(), more))
-
-    @property
-    def gated(self) -> int:
-        """Number of rejected references."""
-        return self._gated
 
     @property
     def mean_misfit(self) -> float:
@@ -317,7 +312,7 @@ class JointFit:
     def _linearise(self) -> None:
         """Linearise all blocks about the newest estimate."""
         self._linear = self._x.copy()
-        self.used = self._gated = 0
+        self.used = self.gated = 0
         self._misfit = 0.0
         for number, day in enumerate(self._days):
             x = self._linear[self._of_day(number)]
@@ -363,12 +358,12 @@ class JointFit:
             gram, fold = None, -1
             is_gross = part.rows is not None and bool((np.abs(part.level - day.level) > GROSS * day.level_std).any())
             if is_gross and part.rows is not None:
-                self._gated += len(part.rows.times)
+                self.gated += len(part.rows.times)
             elif part.rows is not None and np.isfinite(day.white).all():
                 misfit = part.misfit(day.single)
                 good = misfit <= OUTLIER_SQUARE
                 self.used += int(np.count_nonzero(good))
-                self._gated += int(np.count_nonzero(~good))
+                self.gated += int(np.count_nonzero(~good))
                 self._misfit += float(misfit[good].sum())
                 bins = part.bins(day.single)
                 gram, fold = gram_of(bins, day.white, x, part.slope_variance), int(bins.fold[len(bins.fold) // 2])

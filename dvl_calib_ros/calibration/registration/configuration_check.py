@@ -29,7 +29,7 @@ from .unregistrable_clocks import MOVING_MPS
 # into the earth frame agree with an earth-frame reference without residual, so only the heading reveals them.
 
 # Mean resultant length: directions agree above, and headings differ below (25° about their mean).
-MIN_RESULTANT = 0.9
+RESULTANT_LIMIT = 0.9
 # Largest ratio of the spread in the earth frame to the spread in the body frame for earth-frame velocities.
 MAX_SPREAD_RATIO = 0.25
 
@@ -63,18 +63,18 @@ class Directions:
         NED needs several headings: a vehicle that yaws in waves on a straight course looks like NED.
         """
         of_body, of_enu, of_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
-        if of_enu < 1.0 - MIN_RESULTANT and of_enu < MAX_SPREAD_RATIO * of_body:
+        if of_enu < 1.0 - RESULTANT_LIMIT and of_enu < MAX_SPREAD_RATIO * of_body:
             return True
-        return self._headings_are_several and of_ned < 1.0 - MIN_RESULTANT and of_ned < MAX_SPREAD_RATIO * of_body
+        return self._headings_are_several and of_ned < 1.0 - RESULTANT_LIMIT and of_ned < MAX_SPREAD_RATIO * of_body
 
     @property
     def stay_in_the_body(self) -> bool:
         """True if the velocity direction is constant in the body over several headings."""
-        return self._headings_are_several and self._length(self._body) > MIN_RESULTANT
+        return self._headings_are_several and self._length(self._body) > RESULTANT_LIMIT
 
     @property
     def _headings_are_several(self) -> bool:
-        return self._length(self._heading) < MIN_RESULTANT
+        return self._length(self._heading) < RESULTANT_LIMIT
 
 
 # Largest misfit of a reported configuration, as a share of the speed and of the misfit of the configured one.

@@ -43,7 +43,7 @@ ROUNDS, CONVERGED_STEP = 12, 5e-4
 # Largest delay step per round, s: the slopes are valid this far.
 MAX_DELAY_STEP_S = 0.7
 # Round from which a fit is given up if its residual exceeds `most` and this share of the last one.
-FAILED_AFTER, MIN_DECREASE = 3, 0.9
+FAILED_AFTER, MAX_LEVEL_RATIO = 3, 0.9
 # Residual in σ at which a sample has half the weight.
 HALF_WEIGHT_Z = 3.0
 # Lowest compared reference speed, m/s.
@@ -212,7 +212,7 @@ class MotionFit:
                 return None
             solved = self._solved(x, rows, nominal, rotation, in_time)
             step, _, level, _ = solved
-            if number >= FAILED_AFTER and level > max(most, MIN_DECREASE * left):
+            if number >= FAILED_AFTER and level > max(most, MAX_LEVEL_RATIO * left):
                 return None
             left = level
             far = float(np.abs(step[[DELTA, RHO]]).max())

@@ -270,7 +270,7 @@ class Aligner(LiveAlignment):
             refused = np.bincount(block.refused, minlength=1 + len(block.reasons))[1:]
             for reason, count in zip(block.reasons, refused.tolist(), strict=True):
                 if count:
-                    self.reason_of_refusal[block.stream.value].add(reason)
+                    self.refusal_counters[block.stream.value].add(reason)
                     tally[reason] += count
             add_count(tally, "invalid", len(block) - int(np.count_nonzero(is_valid)) - int(refused.sum()))
             add_count(tally, "duplicate", order.duplicate)
@@ -344,7 +344,7 @@ def counted(
         counts["reference"].setdefault(key, 0)
     for key in ("paired", "unpaired", "without_attitude", "oriented", "not_oriented"):
         pairing.setdefault(key, 0)
-    not_accepted = {"invalid", "duplicate", "out_of_order", "stray", "held", *aligner.reason_of_refusal["dvl"]}
+    not_accepted = {"invalid", "duplicate", "out_of_order", "stray", "held", *aligner.refusal_counters["dvl"]}
     dvl["accepted"] = dvl["received"] - sum(dvl.get(key, 0) for key in not_accepted)
     dvl["awaiting_imu"] = aligner.rows.end - aligner.partners.n_judged
     dvl["usable"] = dvl["accepted"] - sum(dvl[key] for key in (*unused, "awaiting_imu"))

@@ -99,7 +99,7 @@ class LiveAlignment:
             name: Counter() for name in (*(each.value for each in Stream), "pairing")
         }
         # counter names of refused messages, by stream
-        self.reason_of_refusal: dict[str, set[str]] = {stream.value: set() for stream in Stream}
+        self.refusal_counters: dict[str, set[str]] = {stream.value: set() for stream in Stream}
         # streams that still deliver samples from before a restart of the DVL stamps
         self._before_restart: set[Stream] = set()
         self._n_messages = 0
@@ -138,7 +138,7 @@ class LiveAlignment:
 
     def refuse(self, stream: Stream, reason: str) -> None:
         """Count a message of a stream that is no sample, by reason."""
-        self.reason_of_refusal[stream.value].add(reason)
+        self.refusal_counters[stream.value].add(reason)
         self.tally[stream.value]["received"] += 1
         self.tally[stream.value][reason] += 1
         self._n_messages += stream is Stream.DVL

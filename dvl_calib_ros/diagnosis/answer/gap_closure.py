@@ -20,6 +20,8 @@ from ..search.effect_selection import EffectSelection
 from ..search.unexplained import Unexplained, is_predictive
 
 RESAMPLES = 1000
+# Least ratio of the unexplained error to the noise that is reported
+REPORTED_RATIO = 0.3
 Integers = NDArray[np.intp]
 
 
@@ -55,6 +57,11 @@ class Gap:
     def fails_held_out(self) -> bool:
         """Return whether the effects leave more than the noise in stretches that they were not fitted to."""
         return self.not_expected > self.noise_floor
+
+    @property
+    def is_reported(self) -> bool:
+        """Return whether the unexplained error is large enough beside the noise to be reported."""
+        return self.not_explained > REPORTED_RATIO * self.noise_floor
 
     @property
     def beyond_noise(self) -> float:
@@ -213,9 +220,9 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     gram = columns.T @ columns
     shares = []
     for true_error, step in zip(truths, np.array_split(draws, len(truths)), strict=True):
-        variance = np.einsum("ri,ij,rj->r", step, gram, step)
+        energy = np.einsum("ri,ij,rj->r", step, gram, step)
         residual, error = true_error - corrected, true_error
-        of_residual, of_error = (each @ each - 2.0 * step @ (columns.T @ each) + variance for each in (residual, error))
+        of_residual, of_error = (each @ each - 2.0 * step @ (columns.T @ each) + energy for each in (residual, error))
         share = 1.0 - (of_residual + of_cause) / np.maximum(of_error + of_cause, 1e-300)
         shares.append(np.clip(share, -1.0, 1.0))
     low, high = np.percentile(np.concatenate(shares), [2.5, 97.5]).tolist()

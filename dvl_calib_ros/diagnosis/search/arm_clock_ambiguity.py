@@ -26,7 +26,7 @@ ARM_PARAMETERS = "x_m", "y_m", "z_m"
 # At one speed, arm and clock are inseparable if a joint fit inflates the arm's σ by this factor
 MAX_INFLATION = 3.5
 # Ambiguity of the arm, m, from which registration limits the precision of arm and clock
-MAX_ARM_M = 0.1
+AMBIGUITY_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ def is_open(guesses: Sequence[FirstGuess]) -> bool:
 
 
 def separable_clocks(guesses: Sequence[FirstGuess]) -> set[str]:
-    """Return the clock offsets of recordings that leave less than `MAX_ARM_M` of the lever arm open to a clock."""
+    """Return the clock offsets of recordings that leave less than `AMBIGUITY_M` of the lever arm open to a clock."""
     found = [each.registration for each in guesses if each.registration is not None]
-    return {name for each in found if np.trace(each.left_open[3:6, 3:6]) < MAX_ARM_M**2 for name in each.offsets}
+    return {name for each in found if np.trace(each.left_open[3:6, 3:6]) < AMBIGUITY_M**2 for name in each.offsets}
 
 
 def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> dict[str, float]:
@@ -86,7 +86,7 @@ def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) ->
     """
     observable = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
     stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
-    known = np.min(stds, axis=0) < MAX_ARM_M if stds else np.zeros(3, dtype=bool)
+    known = np.min(stds, axis=0) < AMBIGUITY_M if stds else np.zeros(3, dtype=bool)
     arm = np.median([guess.lever_arm for guess in guesses], axis=0)
     return {
         name: value if name in observable or is_known else 0.0
@@ -162,7 +162,7 @@ def arm_ambiguity(guesses: Sequence[FirstGuess]) -> ArmAmbiguity | None:
     """Return the ambiguity of the least ambiguous recording. Return None if it is negligible."""
     found = [each.registration for each in guesses if each.registration is not None]
     best = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
-    if best is None or np.trace(best.left_open[3:6, 3:6]) < MAX_ARM_M**2:
+    if best is None or np.trace(best.left_open[3:6, 3:6]) < AMBIGUITY_M**2:
         return None
     delay_std_s = float(np.sqrt(np.trace(best.left_open) / (best.open_by @ best.open_by)))
     return ArmAmbiguity(dict(zip(ARM_PARAMETERS, best.open_by[3:6].tolist(), strict=True)), delay_std_s)
