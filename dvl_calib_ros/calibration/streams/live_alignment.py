@@ -266,8 +266,8 @@ class LiveAlignment:
                 self.tally[stream.value]["before_restart"] += len(admitted)
                 return False
             self._before_restart.discard(stream)
-        for one in admitted:
-            self._append(track, one)
+        for each in admitted:
+            self._append(track, each)
         return bool(admitted)
 
     def _append(self, track: Track, sample: ReferenceSample | ImuSample) -> None:
