@@ -34,8 +34,8 @@ class Assembler:
         self._motion_is_noise = first.motion_is_noise
         priors = [prior(model, parameters) for model in self.models]
         self.prior = GaussianState(np.array([each.x for each in priors]), np.array([each.p for each in priors]))
-        begun = initial or {}
-        self._starts = [begun.get(model.name) or known for model, known in zip(self.models, priors, strict=True)]
+        given = initial or {}
+        self._starts = [given.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
         self._floors = [_floor(model, parameters) for model in self.models]
         held = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
         self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
