@@ -96,20 +96,20 @@ def scatter(log: Log) -> list[Scatter]:
     if log.selection is None:
         return []
     problem, hypothesis = log.selection.fitter.problem, log.selection.fit.hypothesis
-    found = []
+    scatters = []
     for index, (recording, residual) in enumerate(zip(log.recordings, log.residuals, strict=True)):
         dvl = recording.dvl
         if dvl.interval <= FAST_ENOUGH_S:
-            values, inner, norm_of = _differences(dvl.time, dvl.values, dvl.interval, (1.0, -4.0, 6.0, -4.0, 1.0))
+            values, middle, white_norm = _differences(dvl.time, dvl.values, dvl.interval, (1.0, -4.0, 6.0, -4.0, 1.0))
             of_reference, thin = 0.0, 5
         else:
-            values, inner, norm_of = _differences(dvl.time, residual, dvl.interval, (1.0, -2.0, 1.0))
+            values, middle, white_norm = _differences(dvl.time, residual, dvl.interval, (1.0, -2.0, 1.0))
             of_reference, thin = float(np.mean(recording.reference.noise)), 3
         if len(values) < FEWEST_BLOCKS * BLOCK:
             continue
-        motion = problem.seen(hypothesis, index, dvl.time[inner]).motion
-        found.append(Scatter(values / norm_of, motion, thin, of_reference))
-    return found
+        motion = problem.seen(hypothesis, index, dvl.time[middle]).motion
+        scatters.append(Scatter(values / white_norm, motion, thin, of_reference))
+    return scatters
 
 
 def _differences(
@@ -190,15 +190,15 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
     for name, unit in units.items():
         if not all(name in each for each in slopes):
             continue
-        (a, std_a), (b, std_b) = (each[name] for each in slopes)
+        (vehicle_slope, vehicle_std), (simulator_slope, simulator_std) = (each[name] for each in slopes)
         is_present = tuple(_is_significant(each, name) for each in slopes)
-        p = float(2.0 * norm.sf(abs(a - b) / np.hypot(std_a, std_b)))
+        p = float(2.0 * norm.sf(abs(vehicle_slope - simulator_slope) / np.hypot(vehicle_std, simulator_std)))
         found.append(
             Candidate(
                 f"growth_with_{name}",
                 unit,
-                around(a, std_a),
-                around(b, std_b),
+                around(vehicle_slope, vehicle_std),
+                around(simulator_slope, simulator_std),
                 p,
                 (is_present[0], is_present[1]),
                 matters=any(is_present),
@@ -241,25 +241,25 @@ def _covariates(scattered: Scatter) -> dict[str, Array]:
 
 def slopes_of(scattered: Sequence[Scatter]) -> Slopes:
     """Fit slope and standard deviation by covariate to log squares, with the scatter of blocks (sandwich estimate)."""
-    each = [_covariates(one) for one in scattered]
-    names = [name for name in SPREAD if all(name in one for one in each)]
-    columns = {name: np.concatenate([one[name] for one in each]) for name in names}
+    covariates = [_covariates(side) for side in scattered]
+    names = [name for name in SPREAD if all(name in side for side in covariates)]
+    columns = {name: np.concatenate([side[name] for side in covariates]) for name in names}
     if np.mean(columns["astern"] > ASTERN_MPS) <= ASTERN_SHARE:
         del columns["astern"]
     columns = {name: column for name, column in columns.items() if np.std(column) > SPREAD[name]}
     if not columns:
         return {}
-    values = np.concatenate([each.values for each in scattered])
+    values = np.concatenate([covariates.values for covariates in scattered])
     scale = robust_std(values)
     log_square = np.log(np.maximum(((values / scale) ** 2).mean(axis=1), 1e-12))
-    x = np.column_stack([np.ones(len(values)), *(column - column.mean() for column in columns.values())])
-    inverse = np.linalg.pinv(x.T @ x)
-    parameters = inverse @ x.T @ log_square
-    block = np.arange(len(x)) // BLOCK
-    sample_scores = (log_square - x @ parameters)[:, None] * x
+    design = np.column_stack([np.ones(len(values)), *(column - column.mean() for column in columns.values())])
+    inverse = np.linalg.pinv(design.T @ design)
+    parameters = inverse @ design.T @ log_square
+    block = np.arange(len(design)) // BLOCK
+    sample_scores = (log_square - design @ parameters)[:, None] * design
     scores = np.stack([np.bincount(block, column) for column in sample_scores.T], axis=1)
     n = len(scores)
-    covariance = inverse @ (scores.T @ scores) @ inverse * n / max(n - x.shape[1], 1)
+    covariance = inverse @ (scores.T @ scores) @ inverse * n / max(n - design.shape[1], 1)
     std = np.sqrt(np.diag(covariance))
     return {name: (0.5 * float(parameters[i]), 0.5 * float(std[i])) for i, name in enumerate(columns, start=1)}
 

@@ -181,9 +181,9 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
 def _fold_of(problem: Problem, recording: int) -> Array:
     """Return the fold (N,) of each DVL sample of a recording: stretches of time in turn; -1 outside the fit."""
     time = problem.recordings[recording].dvl.time - problem.grids[recording].delay_s
-    of = problem.grids[recording].bin_time
+    bin_times = problem.grids[recording].bin_time
     fold = stretch_of(time) % SETTINGS.folds
-    inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)
+    inside = (time >= bin_times[0]) & (time <= bin_times[-1]) if len(bin_times) else np.zeros(len(time), dtype=bool)
     return np.where(inside, fold, -1)
 
 
@@ -263,16 +263,16 @@ def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generat
     scale = np.maximum(robust_std(np.concatenate([a, b])), 1e-9)
     both = np.concatenate([a, b]) / scale
     distances = np.linalg.norm(both[:, None] - both[None], axis=2)
-    w = len(a)
-    if w < 4:
+    n_windows = len(a)
+    if n_windows < 4:
         return np.nan, np.nan, np.nan
-    sign = np.concatenate([np.ones(w), -np.ones(w)])
+    sign = np.concatenate([np.ones(n_windows), -np.ones(n_windows)])
 
     def energy(signs: Array) -> Array:
         """Return -s'Ds / w², which is 2 E|X-Y| - E|X-X'| - E|Y-Y'|."""
-        return -np.einsum("...i,ij,...j->...", signs, distances, signs) / w**2
+        return -np.einsum("...i,ij,...j->...", signs, distances, signs) / n_windows**2
 
-    swap = rng.choice([-1.0, 1.0], (PERMUTATIONS, w))
+    swap = rng.choice([-1.0, 1.0], (PERMUTATIONS, n_windows))
     null = energy(np.concatenate([swap, -swap], axis=1))
     value = float(energy(sign))
     p = (1.0 + np.count_nonzero(null >= value)) / (1.0 + PERMUTATIONS)
