@@ -60,16 +60,16 @@ def stretches(
     if share < 1.0:  # samples after a gap are processed individually, which must be a small part of a window
         at_once = min(at_once, 1 + int(len(arrival) * share / (WINDOWS * STRETCHES_OF_A_WINDOW)))
     ends = [*arrival[at_once::at_once].tolist(), int(arrival[-1]) + 1] if len(arrival) else []
-    cut = {stream: [_Cut(part, ends) for part in columns.get(stream, ())] for stream in Stream}
+    cuts = {stream: [_Cut(part, ends) for part in columns.get(stream, ())] for stream in Stream}
     for index in range(len(ends)):
         if (len(ends) - 1 - index) * WINDOWS % len(ends) >= share * len(ends):
             continue
-        log_ns = max(each.newest_ns(index) for cuts in cut.values() for each in cuts)
+        log_ns = max(each.newest_ns(index) for parts in cuts.values() for each in parts)
         dvl, reference, imu = (
             _block(
                 stream,
-                [laid for each in cut[stream] if len(laid := each.laid(index))],
-                [each.singles(index) for each in cut[stream]],
+                [laid for each in cuts[stream] if len(laid := each.laid(index))],
+                [each.singles(index) for each in cuts[stream]],
                 decoder,
             )
             for stream in (Stream.DVL, Stream.REFERENCE, Stream.IMU)
