@@ -207,7 +207,7 @@ def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
         identity, other_identity = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
         if identity == other_identity and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
             raise InputError(
-                f"{one.name}, {other.name}: are one calibration by two names, which cannot be compared with itself"
+                f"{one.name}, {other.name}: are the same calibration, which cannot be compared with itself"
             )
 
 
@@ -225,8 +225,8 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
     pairs = [Difference.between(*two) for two in combinations(ordered, 2)]
     if not any(pair.compared[MOUNTING].any() for pair in pairs):
         raise InputError(
-            f"{', '.join(each.name for each in ordered)}: no angle that two of them have shown, so there is nothing to "
-            "compare; calibrate on more data (dvl-calib doctor says what is missing)"
+            f"{', '.join(each.name for each in ordered)}: no angle is observable in two of them, so there is nothing "
+            "to compare; calibrate on more data (dvl-calib doctor says what is missing)"
         )
     accepted = [each for each in ordered if not each.rejected]
     series = accepted or ordered

@@ -24,7 +24,7 @@ def check_model(parameters: Parameters) -> None:
     """Raise ParameterError if the model needs positions and the reference has velocities."""
     if parameters.model == POSITIONS.name and not are_positions(parameters):
         raise ParameterError(
-            f"model: {POSITIONS.name} goes by positions, and {parameters.gnss_type} holds velocities; name another "
+            f"model: {POSITIONS.name} needs positions, but {parameters.gnss_type} holds velocities; name another "
             "model, or a topic of positions (--gnss-topic, gnss_type: NavSatFix or PoseWithCovarianceStamped)"
         )
 
