@@ -268,11 +268,7 @@ def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
     if cause is None:
         return {}
     setting = "-" if math.isnan(cause.setting) else f"{cause.setting:.1f}"
-    return {
-        "cause of the scale": cause.sentence,
-        "speed of sound": cause.brief,
-        "speed of sound to set [m/s]": setting,
-    }
+    return {"cause of the scale": cause.sentence, "speed of sound": cause.brief, "speed of sound to set [m/s]": setting}
 
 
 def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) -> dict[str, str]:

@@ -330,16 +330,14 @@ def in_words(navigation: Navigation) -> list[str]:
     before, after = navigation.before, navigation.after
     is_whole = navigation.stretches == 1
     over = f"over {navigation.distance_m:.0f} m" if is_whole else f"over stretches of {navigation.stretch_m:.0f} m"
-    sentences = [
+    end = "." if navigation.on_a_map else "; headings are unknown, so one course is assumed."
+    return [
         f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
         f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %). "
-        f"Noise of reference, attitude and DVL alone may make {metres(navigation.noise_per_km)} m."
-    ]
-    sentences.append(
+        f"Noise of reference, attitude and DVL alone may make {metres(navigation.noise_per_km)} m.",
         f"After {navigation.distance_m:.0f} m the track is {metres(before.end)} m off as mounted, "
-        f"{metres(after.end)} m corrected" + ("." if navigation.on_a_map else "; without headings, as on one course.")
-    )
-    return sentences
+        f"{metres(after.end)} m corrected{end}",
+    ]
 
 
 def metres(value: float) -> str:

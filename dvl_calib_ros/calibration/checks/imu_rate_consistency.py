@@ -37,11 +37,7 @@ LEVEL_BELOW = 1e-6
 _BODY, _ENU, _NED = range(3)
 _AXES = "xyz"
 _INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
-_KNOWN = {
-    (1, 1, -1): "HEADING_CLOCKWISE",
-    (-1, -1, -1): "RATES_NEGATED",
-    (1, -1, -1): "IMU_AXES_MIXED",
-}
+_NAMED_SIGNS = {(1, 1, -1): "HEADING_CLOCKWISE", (-1, -1, -1): "RATES_NEGATED", (1, -1, -1): "IMU_AXES_MIXED"}
 
 
 def _conventions() -> Iterator[tuple[Reason, Array]]:
@@ -49,7 +45,7 @@ def _conventions() -> Iterator[tuple[Reason, Array]]:
 
     On a level vehicle that only turns about z, many fit equally.
     """
-    known_ones = [(finding(code), np.diag(signs).astype(float)) for signs, code in _KNOWN.items()]
+    known_ones = [(finding(code), np.diag(signs).astype(float)) for signs, code in _NAMED_SIGNS.items()]
     yield from known_ones
     for order in permutations(range(3)):
         for signs in all_of((1, -1), repeat=3):

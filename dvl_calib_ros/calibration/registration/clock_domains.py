@@ -82,9 +82,7 @@ class StreamClocks:
     """Stamps of reference and IMU minus the stamp of the last DVL message before them (live: of the next one)."""
 
     def __init__(self) -> None:
-        self._ahead: dict[Stream, _ThinnedValues] = {
-            stream: _ThinnedValues() for stream in (Stream.REFERENCE, Stream.IMU)
-        }
+        self._ahead = {stream: _ThinnedValues() for stream in (Stream.REFERENCE, Stream.IMU)}
         self._newest: dict[Stream, int] = {}  # live: newest stamp by stream, and values to be added
         self._waiting: dict[Stream, list[int]] = {stream: [] for stream in self._ahead}
         self._cached: tuple[Parameters, list[Reason]] | None = None  # of all messages so far

@@ -30,7 +30,7 @@ MIN_OVERLAP, MIN_OVERLAP_S = 0.4, 20.0
 SEPARATION_S = 2.0
 
 
-class DelayCandidate(NamedTuple):
+class DelayPair(NamedTuple):
     """Candidate delays of reference and DVL relative to the IMU, s. misfit: share of the squares left."""
 
     reference: float
@@ -46,7 +46,7 @@ class _Series(NamedTuple):
     squares: Array
 
 
-def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None, n: int = 4) -> list[DelayCandidate]:
+def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None, n: int = 4) -> list[DelayPair]:
     """Return the likeliest delays by misfit, always with the best ones within 3 s.
 
     rotation_body_from_dvl: (3, 3), None if unknown. Without an attitude, or with a body-frame reference, only the
@@ -60,18 +60,18 @@ def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None
     return sorted(set(found), key=lambda place: place.misfit)
 
 
-def _minima(misfit: Array, by_reference: Array, by_dvl: Array, count: int) -> list[DelayCandidate]:
+def _minima(misfit: Array, by_reference: Array, by_dvl: Array, count: int) -> list[DelayPair]:
     """Return the `count` lowest local minima of a misfit (R, D) over reference and DVL delays (R,) and (D,), s."""
     padded = np.pad(misfit, 1, constant_values=np.inf)  # only local minima, so that flanks of a broad one do not count
     is_lowest = np.minimum(misfit, np.minimum(padded[2:, 1:-1], padded[:-2, 1:-1])) == misfit
     is_lowest &= np.minimum(misfit, np.minimum(padded[1:-1, 2:], padded[1:-1, :-2])) == misfit
     misfit = np.where(is_lowest, misfit, np.inf)
-    found: list[DelayCandidate] = []
+    found: list[DelayPair] = []
     for _ in range(count):
         row, column = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
         if not np.isfinite(misfit[row, column]):
             break
-        candidate = DelayCandidate(float(by_reference[row]), float(by_dvl[column]), float(misfit[row, column]))
+        candidate = DelayPair(float(by_reference[row]), float(by_dvl[column]), float(misfit[row, column]))
         found.append(candidate)
         near = np.abs(by_reference - candidate.reference)[:, None] < SEPARATION_S
         misfit[near & (np.abs(by_dvl - candidate.dvl) < SEPARATION_S)] = np.inf

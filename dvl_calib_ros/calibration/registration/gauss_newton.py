@@ -287,24 +287,22 @@ class MotionFit:
         Streams: B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), slope noise gain (J,).
         """
         m = self._motion
-        body_times = self.times - reference
+        body_at = self.times - reference
         if m.in_earth and not m.has_attitude:
             return None
-        velocity, slope, gain, is_known = self._curves.velocity(self.times + apart)
+        velocity, slope, gain, known = self._curves.velocity(self.times + apart)
         needed = m.in_earth or not all(m.measured)
-        rotation, oriented = (
-            attitude_at(m.imu, body_times, GAP_S) if needed else (np.zeros((len(body_times), 3, 3)), is_known)
-        )
+        rotation, oriented = attitude_at(m.imu, body_at, GAP_S) if needed else (np.zeros((len(body_at), 3, 3)), known)
         if m.in_earth:
-            is_known = is_known & oriented
+            known = known & oriented
         if among is not None:
-            is_known = is_known & self._shared(among, reference, apart)
-        if np.count_nonzero(is_known) < FEWEST_SAMPLES:
+            known = known & self._shared(among, reference, apart)
+        if np.count_nonzero(known) < FEWEST_SAMPLES:
             return None
-        rows = np.flatnonzero(is_known)
+        rows = np.flatnonzero(known)
         reference_velocity, rotation = self._velocity[rows], rotation[rows]
         body = np.einsum("nji,nj->ni", rotation, reference_velocity) if m.in_earth else reference_velocity
-        return rows, (body, self._curves.rates(body_times[rows]), velocity[rows], slope[rows], rotation, gain[rows])
+        return rows, (body, self._curves.rates(body_at[rows]), velocity[rows], slope[rows], rotation, gain[rows])
 
     def _shared(self, other: Fitted, reference: float, apart: float) -> Mask:
         """Return a mask (J,) of references whose DVL samples and attitudes another fit compares, too."""
@@ -382,11 +380,9 @@ def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Cl
     p = np.linalg.inv(information)
     blocks = TimeBlocks()
     for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):
-        design = rows.jacobian[part].reshape(-1, N)
+        h = rows.jacobian[part].reshape(-1, N)
         w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
-        blocks.add(
-            ((design * w).T @ design)[None], (-(design * w).T @ rows.residual[part].ravel())[None], float(len(design))
-        )
+        blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
     factor = blocks.inflation(0, np.zeros(N), p, CLOCK_LASTING_Z, None)
     inflation = max(float(factor[[DELTA, RHO]].max()), _correlation_inflation(rows.residual))
     return Claimed(p * np.outer(factor, factor), inflation, factor)

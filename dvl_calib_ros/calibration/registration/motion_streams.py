@@ -119,9 +119,8 @@ def make_motion(
     reference_times, velocities = _cleaned(*reference)
     if min(len(times), len(reference_times)) < 2 or not any(measured):
         return None
-    return MotionStreams(
-        DvlColumns(times, velocity), reference_times, velocities, in_earth, measured, imu, TurnRates.of(imu)
-    )
+    columns = DvlColumns(times, velocity)
+    return MotionStreams(columns, reference_times, velocities, in_earth, measured, imu, TurnRates.of(imu))
 
 
 def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:

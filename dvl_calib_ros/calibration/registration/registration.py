@@ -320,17 +320,15 @@ def _reference_clock(fit: MotionFit, free: Fitted, delay_s: float, rotation: Arr
     """Return open_std_s and open_by of a fit with free clocks. delay_s: adopted reference delay, s."""
     if not fit.is_turned:
         return {"open_std_s": 0.0, "open_by": np.zeros(7)}
-    std, sensitivity, offset = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
+    # by: sensitivity of all states to the reference delay
+    std, by, offset = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
     if offset > OPEN_Z * std and delay_s == 0.0:
         std = offset
     if offset > OPEN_Z * PRIOR_DELAY_STD_S and delay_s == 0.0:
         # the free delay is so large that its sensitivities do not hold at zero delay
         prior_fit = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / PRIOR_DELAY_STD_S),))
-        std, sensitivity = max(std, offset), sensitivity if prior_fit is None else prior_fit.by(RHO)
-    return {
-        "open_std_s": std,
-        "open_by": np.concatenate([sensitivity[TURN], sensitivity[ARM], [1.0 + sensitivity[DELTA]]]),
-    }
+        std, by = max(std, offset), by if prior_fit is None else prior_fit.by(RHO)
+    return {"open_std_s": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[DELTA]]])}
 
 
 def _with_prior(std: float) -> float:
@@ -386,21 +384,19 @@ def _way(clock: Clock) -> str:
     return "late" if clock.delay_s > 0.0 else "early"
 
 
-def _is_as_good(
-    motion: MotionStreams, fit: MotionFit, candidate: Fitted, closest: Fitted, rotation: Array | None
-) -> bool:
+def _is_as_good(motion: MotionStreams, fit: MotionFit, other: Fitted, closest: Fitted, rotation: Array | None) -> bool:
     """Return whether a candidate fits about as well as the one with the smallest residual, on the same data.
 
     A delay may lower the residual by moving a bad DVL stretch out of the overlap. Candidates with other DVL delays also
     sample other DVL noise; in periodic waves this alone makes a difference.
     """
-    is_read_elsewhere = abs(float(candidate.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
-    chance_gain = LOG_GAIN + (_chance_gain_std(motion, candidate, fit.dvl_noise) if is_read_elsewhere else 0.0)
-    if _gain(motion, candidate, closest) < chance_gain:
+    is_read_elsewhere = abs(float(other.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
+    chance_gain = LOG_GAIN + (_chance_gain_std(motion, other, fit.dvl_noise) if is_read_elsewhere else 0.0)
+    if _gain(motion, other, closest) < chance_gain:
         return True
-    if closest.rows > MIN_ROW_SHARE * candidate.rows:
+    if closest.rows > MIN_ROW_SHARE * other.rows:
         return False
-    refitted = fit(float(candidate.x[RHO]), float(candidate.x[DELTA]), rotation, (), closest)
+    refitted = fit(float(other.x[RHO]), float(other.x[DELTA]), rotation, (), closest)
     if refitted is None:
         return False
     grown = refitted.cost(closest.level, refitted.at) - closest.cost(closest.level, refitted.at)

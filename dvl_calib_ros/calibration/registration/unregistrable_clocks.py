@@ -137,8 +137,8 @@ def lag(
     series_start: float,
     other: Series,
     other_start: float,
-    other_weight: Array | None = None,
-    series_weight: Array | None = None,
+    weight: Array | None = None,
+    own: Array | None = None,
 ) -> tuple[float, bool]:
     """Return the delay (s) of a series relative to another, and whether it surely exceeds FARTHEST_S.
 
@@ -148,11 +148,11 @@ def lag(
     ----------
     series, other: (N,), (M,), every STEP_S.
     series_start, other_start: Times of their first samples, s.
-    other_weight, series_weight: (M,) weights of `other`, (N,) of `series`; default 1.
+    weight, own: (M,) weights of `other`, (N,) of `series`; default 1.
     """
     n, m = len(series), len(other)
-    other_weight = np.ones(m) if other_weight is None else other_weight
-    series_weight = np.ones(n) if series_weight is None else series_weight
+    weight = np.ones(m) if weight is None else weight
+    own = np.ones(n) if own is None else own
     size = n + m
 
     def correlated(a: Series | Array, b: Series | Array) -> Array:
@@ -160,17 +160,15 @@ def lag(
         sums = np.real(np.fft.ifft(np.fft.fft(a, size) * np.conj(np.fft.fft(b, size))))
         return np.concatenate([sums[size - (m - 1) :], sums[:n]])
 
-    def means(other_weight: Array) -> Array:
+    def means(weight: Array) -> Array:
         """Return the mean squared difference at each lag, infinite where the overlap is too short."""
-        count = correlated(series_weight, other_weight)
-        squares = correlated(series_weight * np.abs(series) ** 2, other_weight) + correlated(
-            series_weight, other_weight * np.abs(other) ** 2
-        )
-        squares -= 2.0 * correlated(series_weight * series, other_weight * other)
-        is_enough = count >= max(MIN_OVERLAP * min(float(n), float(other_weight.sum())), SHORTEST_OVERLAP_S / STEP_S)
+        count = correlated(own, weight)
+        squares = correlated(own * np.abs(series) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
+        squares -= 2.0 * correlated(own * series, weight * other)
+        is_enough = count >= max(MIN_OVERLAP * min(float(n), float(weight.sum())), SHORTEST_OVERLAP_S / STEP_S)
         return np.where(is_enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
 
-    mean = means(other_weight)
+    mean = means(weight)
     delays = series_start - other_start + STEP_S * np.arange(-(m - 1), n)
     is_near = np.abs(delays) <= FARTHEST_S + STEP_S
     best = int(np.argmin(mean))
@@ -178,10 +176,10 @@ def lag(
     if not is_near[best] and mean[best] < MAX_SQUARE_SHARE * smallest_near:
         # compare on the same samples: a noisy stretch may be outside the overlap of the far delay
         index = np.arange(m) + best - (m - 1)
-        overlap = np.where((index >= 0) & (index < n), other_weight, 0.0)
+        overlap = np.where((index >= 0) & (index < n), weight, 0.0)
         smallest_near = min(smallest_near, float(means(overlap)[is_near].min(initial=np.inf)))
         # periodic motion may agree at far lags, but it then agrees at near lags, too, to the change within one step
-        pair_weight = other_weight[1:] * other_weight[:-1]
+        pair_weight = weight[1:] * weight[:-1]
         step_change = float((pair_weight * np.abs(np.diff(other)) ** 2).sum() / max(pair_weight.sum(), 1.0))
         if mean[best] < MAX_SQUARE_SHARE * smallest_near and smallest_near > step_change:
             # repeated legs agree at several lags: take the smallest

@@ -48,10 +48,8 @@ class Clocks:
         """Return the true time (ns) of a DVL stamp, or of stamps (N,). first_ns: first stamp of the run."""
         true_ns = stamp_ns - self.dvl_ns
         if self.drift:
-            drift_ns = self.drift * (stamp_ns - first_ns)
-            true_ns = true_ns - (
-                np.rint(drift_ns).astype(np.int64) if isinstance(drift_ns, np.ndarray) else round(drift_ns)
-            )
+            drift = self.drift * (stamp_ns - first_ns)
+            true_ns = true_ns - (np.rint(drift).astype(np.int64) if isinstance(drift, np.ndarray) else round(drift))
         if self.jump_ns:
             true_ns = true_ns - self.jump_ns * (stamp_ns >= self.jump_at_ns)
         return true_ns

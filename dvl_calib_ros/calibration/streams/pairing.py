@@ -228,9 +228,7 @@ class Gates:
             self._velocity_before, self._repeats = (x, y, z), 0
             return is_same
         index = np.arange(n)
-        last_change = np.maximum.accumulate(
-            np.where(is_same, -1, index)
-        )  # index of the last change; -1: before these samples
+        last_change = np.maximum.accumulate(np.where(is_same, -1, index))  # -1: before these samples
         repeats = np.where(last_change < 0, self._repeats + index + 1, index - last_change)
         self.repeated += int(np.count_nonzero(is_same))
         x, y, z = velocity[-1].tolist()

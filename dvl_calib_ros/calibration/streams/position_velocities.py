@@ -62,9 +62,7 @@ def _deconvolved(times: Array, velocity: Array, window_s: float) -> Array:
         shifted_times.append(shifted)
     corrected, difference = velocity.copy(), velocity
     for factor in SERIES:
-        sides = sum(
-            np.column_stack([np.interp(shifted, times, axis) for axis in difference.T]) for shifted in shifted_times
-        )
+        sides = sum(np.column_stack([np.interp(at, times, axis) for axis in difference.T]) for at in shifted_times)
         difference = np.where(known[:, None], sides - 2.0 * difference, 0.0)
         corrected += factor * difference
         # the next difference needs this one on both sides
