@@ -225,7 +225,7 @@ CONFIGURATIONS = on_page(
         "BODY_OR_EARTH",
         "DVL and reference agree in the body frame, but would agree as well if both were in the earth's frame",
         means="Without an attitude that changes, both fit.",
-        remedy="set gnss_frame to body or to enu",
+        remedy="set gnss_frame",
     ),
     accept(
         "REFERENCE_FRAME_OTHER",
