@@ -118,7 +118,7 @@ class _Fit(NamedTuple):
     weight: Array
     starts: Index
 
-    def seen_of(self, columns: Array, values: Array) -> float:
+    def last_coefficient(self, columns: Array, values: Array) -> float:
         """Return the coefficient of the last column of (N, 3, n) in values (N, 3), adjusted for the others."""
         return float(self.p[-1] @ np.einsum("n,nij,ni->j", self.weight, columns, values))
 
@@ -126,7 +126,7 @@ class _Fit(NamedTuple):
 def residual_trend(
     time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
 ) -> ResidualTrend | None:
-    """Fit the residual velocity; None for too little data.
+    """Fit tilt and smoothing to all samples, bias and moving bed to means; None for too little data.
 
     Parameters
     ----------
@@ -149,56 +149,56 @@ def residual_trend(
     moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
     n = len(time)
     yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
-    passed = (time - time.mean()) / (time[-1] - time[0])
-    around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), passed])
-    quick = np.zeros((n, 3, 3))
+    progress = (time - time.mean()) / (time[-1] - time[0])
+    heading_terms = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), progress])
+    fast_signals = np.zeros((n, 3, 3))
     for axis in range(2):
-        about = np.zeros((n, 3))
-        about[:, axis] = -changing[axis]
-        quick[:, :, axis] = cross(about, moving)
+        tilt_axis = np.zeros((n, 3))
+        tilt_axis[:, axis] = -changing[axis]
+        fast_signals[:, :, axis] = cross(tilt_axis, moving)
     # second derivative of means, so that DVL noise is common to all samples of a mean
     turning = _mean(time, _turned(rotation_enu_from_body, _mean(time, velocity - error, MEAN_S)), BEND_S)
     bend, whole_bend = (
         (_at(time, each, BEND_S) - 2.0 * each + _at(time, each, -BEND_S)) / BEND_S**2 for each in (turning, earth)
     )
-    quick[:, :, 2] = _turned(body_from_enu, bend)
+    fast_signals[:, :, 2] = _turned(body_from_enu, bend)
     # linear interpolation loses this part of the second derivative on average
-    bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
-    both = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), quick], axis=2)
-    fast = _fitted(time, both, bent, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
-    constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
+    fast_residual = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
+    fast_columns = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), fast_signals], axis=2)
+    fast_fit = _fitted(time, fast_columns, fast_residual, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
+    bias_columns = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
-    known = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
-    by_heading = known[:, :, -1, None] * around[:, None]
-    columns = np.concatenate([_means(each, starts) for each in (known, by_heading, constant)], axis=2)
-    likely = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
+    nuisance = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
+    by_heading = nuisance[:, :, -1, None] * heading_terms[:, None]
+    columns = np.concatenate([_means(each, starts) for each in (nuisance, by_heading, bias_columns)], axis=2)
+    prior_std = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
     means = _means(time, starts), columns, _means(error, starts)
-    slow = _fitted(*means, likely, LASTING)
-    likely[OVER_GROUND] = BED_STD_MPS
-    over_bed = _fitted(*means, likely, LASTING)
-    if fast is None or slow is None or over_bed is None:
+    bias_fit = _fitted(*means, prior_std, LASTING)
+    prior_std[OVER_GROUND] = BED_STD_MPS
+    bed_fit = _fitted(*means, prior_std, LASTING)
+    if fast_fit is None or bias_fit is None or bed_fit is None:
         return None
-    over_ground = over_bed.x[OVER_GROUND]
+    over_ground = bed_fit.x[OVER_GROUND]
     # on few headings yaw and bias can compensate any bed velocity, with a small residual
-    if float(over_ground @ median(_turned(rotation_enu_from_body, error)[:, :2])) < 0.5 * float(
-        over_ground @ over_ground
-    ):
+    residual_over_ground = median(_turned(rotation_enu_from_body, error)[:, :2])
+    if float(over_ground @ residual_over_ground) < 0.5 * float(over_ground @ over_ground):
         over_ground = np.zeros(2)
-    tilt, std = fast.x[-3:-1], fast.std[-3:-1]
+    tilt, std = fast_fit.x[-3:-1], fast_fit.std[-3:-1]
     std[[each.std() < LEAST_TILT for each in changing]] = math.inf
     lean = np.array([roll.mean(), pitch.mean()])
     speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
     # without tilt data, wave motion looks like turning
-    shows = max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
+    is_observable = max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
     # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
-    bends_by = fast.seen_of(both, _turned(body_from_enu, whole_bend))
-    shows = shows and bends_by > LEAST_OF_BEND
-    smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
+    bend_gain = fast_fit.last_coefficient(fast_columns, _turned(body_from_enu, whole_bend))
+    is_observable = is_observable and bend_gain > LEAST_OF_BEND
+    smoothed = fast_fit.x[-1] / bend_gain if is_observable else 0.0
+    smoothed_std = fast_fit.std[-1] / bend_gain if is_observable else math.inf
     return ResidualTrend(
-        tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_noise_in_reference(time, velocity - error, error, both, fast, interval_s), over_ground,
-        over_bed.std[OVER_GROUND], float(slow.x[-4]), float(slow.std[-4]),
+        tilt, std, bias_fit.x[-3:], bias_fit.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
+        *_noise_in_reference(time, velocity - error, error, fast_columns, fast_fit, interval_s), over_ground,
+        bed_fit.std[OVER_GROUND], float(bias_fit.x[-4]), float(bias_fit.std[-4]),
     )  # fmt: skip
 
 
