@@ -382,7 +382,7 @@ def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Arr
 
 
 def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None, travel: Array) -> Reason:
-    """Return the finding of another mounting; its remedy names what looks the same.
+    """Return the finding that another mounting fits; its remedy also names a heading offset or axes that look the same.
 
     given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
     travel: (3,) m/s, mean velocity in the DVL. It is ahead with `given` if the heading is wrong, else with `found`.

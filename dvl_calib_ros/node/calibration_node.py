@@ -238,10 +238,10 @@ class CalibrationNode(AnsweringNode):
         decoder = self._feed.decoder
         _, reference, imu = decoder.frame_ids
         dvl = decoder.dvl_frame or frame_name(decoder.dvl_type.frame_id(message))
-        key = (self._transforms.n_messages, (dvl, reference, imu))
-        if key == self._transforms_tried:
+        placement_key = (self._transforms.n_messages, (dvl, reference, imu))
+        if placement_key == self._transforms_tried:
             return
-        self._transforms_tried = key
+        self._transforms_tried = placement_key
         in_body = decoder.frame_of_reference is VelocityFrame.BODY
         frames = Frames(dvl, reference, imu, decoder.dvl_type.points_down, in_body)
         parameters = self._calibrator.parameters
@@ -249,7 +249,7 @@ class CalibrationNode(AnsweringNode):
         if found is None or parameters.replace(**found.values) == parameters:
             return
         moved = parameters.replace(**{name: at for name, at in found.values.items() if name.endswith("_position")})
-        if parameters.replace(**found.values) == moved:  # nothing was estimated with these values
+        if parameters.replace(**found.values) == moved:  # a position alone changes no estimate
             self._calibrator.set_parameters(moved)
             return
         self.info(f"{found.said}; the calibration starts with it (set use_transforms to false to ignore it)")

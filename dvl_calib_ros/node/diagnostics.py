@@ -252,7 +252,7 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
 
 
 def _scale_and_delay_values(estimate: Estimate, parameters: Parameters) -> dict[str, str]:
-    """Return scale and delay, which ~/mounting cannot hold. Keys of states begin with std, so these do not."""
+    """Return scale and delay, which ~/mounting cannot hold, as text; σ under "sigma ...", as "std ..." is of states."""
     state = GaussianState(estimate.state, estimate.covariance)
     scale_delay = scale_and_delay(MODELS[estimate.model], state, parameters)
     values = {"scale error ahead [%]": 100.0 * scale_delay.scale, "dvl_time_offset [s]": scale_delay.time_offset}

@@ -98,13 +98,13 @@ class RemainingTime:
     """
 
     def __init__(self) -> None:
-        self._ends_s: deque[tuple[float, float]] = deque()
-        self._latest_s, self._longer_since_s = math.inf, -math.inf
-        self._promised_at = math.nan
+        self._ends_s: deque[tuple[float, float]] = deque()  # time of each prediction, and the predicted end
+        self._latest_s, self._longer_since_s = math.inf, -math.inf  # latest promised end
+        self._promised_at = math.nan  # drift when it was promised
         self.longer: Reason | None = None
 
     def look(self, seconds: float | None, drift: float, now_s: float) -> float | None:
-        """Return the time left. seconds: current prediction, or None. drift: m per km, as displayed."""
+        """Add a prediction (s; None: unknown). Return the median remaining time, s. drift: m per km, as displayed."""
         if now_s - self._longer_since_s >= STANDS_S:
             self.longer = None
         self._ends_s.append((now_s, math.inf if seconds is None else now_s + seconds))

@@ -161,8 +161,8 @@ class Singles:
         is_whole = self.end[rows] - starts >= STAMP_END
         head = self.content[np.where(is_whole, starts, 0)[:, None] + np.arange(STAMP_END if is_whole.any() else 0)]
         stamps_ns = np.zeros(len(rows), dtype=np.int64)
-        for order, number in (("<", 1), (">", 0)):
-            readable = is_whole & ((head[:, :1] == 0) & (head[:, 1:2] == number)).any(axis=1)
+        for order, flag in (("<", 1), (">", 0)):
+            readable = is_whole & ((head[:, :1] == 0) & (head[:, 1:2] == flag)).any(axis=1)
             seconds, nanoseconds = (
                 np.ascontiguousarray(head[readable, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
                 for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))

@@ -137,7 +137,7 @@ class Recording:
         return self._surveyed({name: self.columns[name] for name in named if name in self.columns}, whole=True)
 
     def _surveyed(self, columns: Mapping[str, tuple[TopicColumns, ...]], *, whole: bool) -> Survey:
-        """Return the previews of topics, and why messages of the others cannot be read."""
+        """Return the previews of readable topics; of the others the reason why their first message cannot be read."""
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
         looks = {
             topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
@@ -146,9 +146,9 @@ class Recording:
         }  # fmt: skip
         read = {topic: look for topic, look in looks.items() if look is not None}
         unread = {
-            topic: why
+            topic: reason
             for topic, parts in columns.items() if topic not in read
-            for *_, why in islice((row for part in parts for row in part.singles.messages(slice(1))), 1) if why
+            for *_, reason in islice((row for part in parts for row in part.singles.messages(slice(1))), 1) if reason
         }  # fmt: skip
         return Survey(self.types, self.counts, read, self.transforms, self.descriptions, unread, self.field_maps)
 

@@ -115,15 +115,15 @@ def scatter(log: Log) -> list[Scatter]:
 def _differences(
     time: Array, values: Array, interval: float, weights: Sequence[float]
 ) -> tuple[Array, NDArray[np.intp], float]:
-    """Return differences (K, 3) of neighbours without a gap, their middle samples, and their norm for white noise."""
-    w, reach = np.array(weights), len(weights) // 2
-    n = len(time) - 2 * reach
+    """Return gapless weighted sums (K, 3) of consecutive samples, their middle indices, and the gain of white noise."""
+    w, n_aside = np.array(weights), len(weights) // 2
+    n = len(time) - 2 * n_aside
     if n < 1:
         return np.zeros((0, values.shape[1])), np.zeros(0, dtype=np.intp), 1.0
-    inner = np.arange(reach, reach + n)
-    sums = np.sum([each * values[k : k + n] for k, each in enumerate(w)], axis=0)
-    adjacent = np.abs(time[2 * reach :] - time[:n] - 2 * reach * interval) < 0.5 * interval
-    return sums[adjacent], inner[adjacent], float(np.sqrt(w @ w))
+    middle = np.arange(n_aside, n_aside + n)
+    sums = np.sum([weight * values[shift : shift + n] for shift, weight in enumerate(w)], axis=0)
+    adjacent = np.abs(time[2 * n_aside :] - time[:n] - 2 * n_aside * interval) < 0.5 * interval
+    return sums[adjacent], middle[adjacent], float(np.sqrt(w @ w))
 
 
 def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:

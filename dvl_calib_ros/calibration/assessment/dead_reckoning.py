@@ -308,10 +308,10 @@ def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
     }
 
 
-def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Reason]:
+def objections(navigation: Navigation | None, predicted_drift: float = 0.0) -> list[Reason]:
     """Return the reasons against a calibration by its drift, which may grow although velocities fit better.
 
-    known_to: predicted drift, m per km (σ); an increase within it is only marginal.
+    predicted_drift: predicted drift, m per km (σ); an increase within it is only marginal.
     """
     if navigation is None or navigation.stretches < MIN_STRETCHES:
         return []
@@ -320,9 +320,9 @@ def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Rea
         if float(metres(after)) <= float(metres(before)):
             return []
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]
-    worse = finding("DRIFT_WORSE", after=after, before=before)
-    is_open = after**2 - before**2 < (2.0 * known_to) ** 2
-    return [worse.weighed(Severity.MARGINAL) if is_open else worse]
+    reason = finding("DRIFT_WORSE", after=after, before=before)
+    is_within_prediction = after**2 - before**2 < (2.0 * predicted_drift) ** 2
+    return [reason.weighed(Severity.MARGINAL) if is_within_prediction else reason]
 
 
 def in_words(navigation: Navigation) -> list[str]:

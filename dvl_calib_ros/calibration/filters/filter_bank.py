@@ -223,6 +223,7 @@ class Group:
         states = after.at
         assert states is not None
         indices = np.searchsorted(all_ends, ends)
+        # sums with a leading zero: entry n is after n samples
         used = np.cumsum(np.pad(after.used, ((0, 0), (1, 0))), axis=1)[:, ends].T
         nis = np.cumsum(np.pad(np.where(after.used, after.nis, 0.0), ((0, 0), (1, 0))), axis=1)[:, ends].T
         return Snapshot(states.x[indices], states.p[indices], self._used + used, self._nis_sum + nis)

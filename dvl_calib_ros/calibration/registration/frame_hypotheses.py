@@ -306,7 +306,8 @@ def turns_right(times: Array, reference_rates: Array, imu: ImuColumns, frame: Im
     if len(reference_rates) < FEWEST_VALUES or _rms(reference_rates) < MIN_TURN_RADPS or _rms(rates) < MIN_TURN_RADPS:
         return None
     misfit_flu, misfit_frd = _rms(reference_rates - rates), _rms(reference_rates @ FLU_FROM_FRD - rates)
-    return None if min(misfit_flu, misfit_frd) > BETTER_BY * max(misfit_flu, misfit_frd) else misfit_frd < misfit_flu
+    is_unclear = min(misfit_flu, misfit_frd) > BETTER_BY * max(misfit_flu, misfit_frd)
+    return None if is_unclear else misfit_frd < misfit_flu
 
 
 def best_rotation(a: Array, b: Array, prior: Array) -> Array:

@@ -328,10 +328,10 @@ class MotionFit:
         if streams is None:
             return None
         at, (body, rates, velocity, slope, attitude, gain) = streams
-        own = (1.0 + x[SCALE]) * velocity @ rotation.T
-        residual = body + cross(rates, self._lever_arm + x[ARM]) - own
+        dvl_in_body = (1.0 + x[SCALE]) * velocity @ rotation.T
+        residual = body + cross(rates, self._lever_arm + x[ARM]) - dvl_in_body
         jacobian = np.zeros((len(at), 3, N))
-        jacobian[:, :, TURN] = skew(own)
+        jacobian[:, :, TURN] = skew(dvl_in_body)
         jacobian[:, :, SCALE] = -velocity @ rotation.T
         jacobian[:, :, ARM] = skew(rates)
         jacobian[:, :, DELTA] = -(1.0 + x[SCALE]) * slope @ rotation.T

@@ -333,6 +333,7 @@ class NewDays:
             return False
         if interval_ns > self._pause_ns:
             return True
+        # in a joint replay, a limit between two recordings lies between the two stamps
         before = bisect_right(self._recordings_ns, stamp_ns - interval_ns)
         return bisect_right(self._recordings_ns, stamp_ns) > before
 
