@@ -33,8 +33,8 @@ from ..calibration.registration.frame_hypotheses import (
     Reading,
     Readings,
     Registered,
+    are_rates_frd,
     nominal_rpy,
-    turns_right,
 )
 from ..calibration.streams.imu_frame import ENU_FROM
 from ..calibration.streams.screening import unit_quaternions
@@ -264,9 +264,9 @@ class FrameChooser:
     def _points_down(self, reference: Look, imu: ImuHypothesis | None) -> bool:
         """Return whether a twist is forward-right-down, by its turn rates or else by its pose's world."""
         if self._imu is not None and imu is not None and reference.rates is not None:
-            turns = turns_right(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
-            if turns is not None:
-                return turns
+            is_frd = are_rates_frd(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
+            if is_frd is not None:
+                return is_frd
         world = frame_named(reference.world, ())  # of the pose: by custom a body in NED is forward-right-down
         return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
 

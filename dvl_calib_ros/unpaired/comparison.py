@@ -171,8 +171,8 @@ def levels_by_regime(log: Log) -> dict[str, float]:
         def __init__(self, motion: EffectInput) -> None:
             self.motion = motion
 
-    seen = [_AtSamples(each.motion) for each in scattered]
-    masks = {"all": np.ones(len(values), dtype=bool)} | regimes(problem, seen, per_sample=True)  # type: ignore[arg-type]
+    motions = [_AtSamples(each.motion) for each in scattered]
+    masks = {"all": np.ones(len(values), dtype=bool)} | regimes(problem, motions, per_sample=True)  # type: ignore[arg-type]
     return {
         name: float(np.linalg.norm(robust_std(values[mask])))
         for name, mask in masks.items()

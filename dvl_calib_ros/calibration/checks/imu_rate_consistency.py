@@ -41,17 +41,17 @@ _NAMED_SIGNS = {(1, 1, -1): "HEADING_CLOCKWISE", (-1, -1, -1): "RATES_NEGATED", 
 
 
 def _conventions() -> Iterator[tuple[Reason, Array]]:
-    """Yield all exchanged or negated axes as B (3, 3), turn rate = B angular velocity; likely ones first.
+    """Yield each exchange or negation of axes: its finding and B (3, 3), turn rate = B angular velocity. Likely first.
 
     On a level vehicle that only turns about z, many fit equally.
     """
-    known_ones = [(finding(code), np.diag(signs).astype(float)) for signs, code in _NAMED_SIGNS.items()]
-    yield from known_ones
+    named = [(finding(code), np.diag(signs).astype(float)) for signs, code in _NAMED_SIGNS.items()]
+    yield from named
     for order in permutations(range(3)):
         for signs in all_of((1, -1), repeat=3):
             axes = ", ".join("-"[: sign < 0] + _AXES[axis] for sign, axis in zip(signs, order, strict=True))
             matrix = np.diag(signs).astype(float) @ np.eye(3)[list(order)]
-            if axes != "x, y, z" and not any((matrix == known).all() for _, known in known_ones):
+            if axes != "x, y, z" and not any((matrix == named_matrix).all() for _, named_matrix in named):
                 yield finding("RATES_EXCHANGED", axes=axes), matrix
 
 

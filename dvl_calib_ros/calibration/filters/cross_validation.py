@@ -94,7 +94,7 @@ class FoldInformation:
     def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
         """Restart from Λ (K, n, n) and Λx (K, n) without each fold."""
         self._begin = known
-        self._told = FoldSums(known[0][0].shape, known[0][1].shape)
+        self._summed = FoldSums(known[0][0].shape, known[0][1].shape)
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples where models used them (K, N)."""
@@ -107,12 +107,12 @@ class FoldInformation:
             weighted = part * weight[:, None, None, samples]
             flat = (*part.shape[:2], -1)
             information = weighted.reshape(flat) @ part.reshape(flat).swapaxes(1, 2)
-            self._told.add(fold, information[..., :-1, :-1], information[..., :-1, -1])
+            self._summed.add(fold, information[..., :-1, :-1], information[..., :-1, -1])
 
     def without(self, fold: int) -> tuple[Array, Array]:
         """Return Λ (K, n, n) and Λx (K, n) without a fold."""
         information, vector = (
-            added + begin for added, begin in zip(self._told.without(fold), self._begin[fold], strict=True)
+            added + begin for added, begin in zip(self._summed.without(fold), self._begin[fold], strict=True)
         )
         return information, vector
 

@@ -330,7 +330,7 @@ class BlockScatter:
         self._blocks = TimeBlocks()
         self._last: int | None = None
         self._state = GaussianState(x, p)
-        self._told = self._state.information
+        self._information = self._state.information
         self._found: dict[int, Array] = {}
 
     def cuts(self, stamps_ns: Stamps) -> Index:
@@ -348,8 +348,8 @@ class BlockScatter:
         """Add the states at the cuts, x (E, K, n), P (E, K, n, n)."""
         for information in _informations(x, p):
             if information is not None:
-                self._blocks.add(information[0] - self._told[0], information[1] - self._told[1], 1.0)
-                self._told = information
+                self._blocks.add(information[0] - self._information[0], information[1] - self._information[1], 1.0)
+                self._information = information
         self._state = GaussianState(x[-1], p[-1])
         self._found.clear()
 
@@ -359,8 +359,8 @@ class BlockScatter:
         of_day: indices (u,) of the states that differ per recording.
         """
         self.add(before.x[None], before.p[None])
-        self._blocks.end_day(of_day, *self._told, np.arange(len(before.x)))
-        self._told, self._state = after.information, after
+        self._blocks.end_day(of_day, *self._information, np.arange(len(before.x)))
+        self._information, self._state = after.information, after
         self._last = None
 
     def inflation(self, index: int) -> Array:

@@ -156,7 +156,7 @@ def _recursion_of_one(
 ) -> tuple[list[GaussianState], list[bool], list[float]]:
     """Filter with the k-th model: x (n,), P (n, n), Q (N, n, n), see `recursion`.
 
-    Return the final state or, if on_the_way, the states before the first and after each sample; used flags; nis.
+    Return the final state or, if with_path, the states before the first and after each sample; used flags; nis.
     """
     n_samples, n = data.z.shape[1], len(x)
     identity = _identity(n)

@@ -208,7 +208,7 @@ def _step_patterns(times: Array) -> Iterator[_ChangePattern]:
 
 def _fit_change(states: Array, weights: Array, change: Array, used: Mask) -> tuple[float, float, float]:
     """Fit a common state plus `change` (S, k) · value to states (S, k). Return residual chi-square, value and its σ."""
-    k = states.shape[1]
+    k = states.shape[1]  # unknowns: the common state (k), then the value
     design = np.concatenate([np.broadcast_to(np.eye(k), (len(states), k, k)), change[:, :, None]], axis=2)[used]
     observed, used_weights = states[used], weights[used]
     information = np.einsum("sij,sik,skl->jl", design, used_weights, design)

@@ -270,25 +270,25 @@ def _configuration_finding(
 ) -> Reason | None:
     """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
     nominal = parameters.rotation_dvl_from_body.T
-    same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
-    if same_frame and as_given:  # a large misalignment is left to the calibration
+    same_frame, same_mounting = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
+    if same_frame and same_mounting:  # a large misalignment is left to the calibration
         return None
     body = VelocityFrame.BODY
     frame = {"name": "the body frame" if best is body else best.value.upper(), "frame": best.value}
-    earth = body not in (best, declared)
-    if as_given and earth and also_turned:
+    both_in_earth = body not in (best, declared)
+    if same_mounting and both_in_earth and also_turned:
         return finding("REFERENCE_OR_IMU_NED", **frame)
-    if as_given:  # the frame alone explains the misfit
+    if same_mounting:  # the frame alone explains the misfit
         return finding("REFERENCE_LOOKS", **frame)
-    if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
+    if not same_frame and both_in_earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
         return _imu_turned(parameters)
     if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
-        turned = _axes_turned(nominal, parameters.dvl_axes)
+        mounting_finding = _axes_turned(nominal, parameters.dvl_axes)
     else:
-        turned = _mounting_fits(_as_drawn(rotation))
+        mounting_finding = _mounting_fits(_as_drawn(rotation))
     if same_frame:
-        return turned
-    return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=turned)
+        return mounting_finding
+    return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=mounting_finding)
 
 
 def _imu_turned(parameters: Parameters) -> Reason:

@@ -295,7 +295,7 @@ class Readings:
         return self._motions[key]
 
 
-def turns_right(times: Array, reference_rates: Array, imu: ImuColumns, frame: ImuFrame) -> bool | None:
+def are_rates_frd(times: Array, reference_rates: Array, imu: ImuColumns, frame: ImuFrame) -> bool | None:
     """Return whether turn rates of the reference agree with the IMU as forward-right-down; None if unclear.
 
     reference_rates: (N, 3) rad/s at times (N,) s. A left turn is positive about an axis up, negative about one down.

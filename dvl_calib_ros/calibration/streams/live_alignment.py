@@ -165,7 +165,7 @@ class LiveAlignment:
             self._count_order(tally, kind)
             if kind is Order.CONFIRMED_RESTART:
                 self._restart(admitted[0].stamp_ns)
-                row = 1
+                row = 1  # after the held sample, which is row 0 of the new run
             elif kind is Order.HELD:
                 self._row_of_held = row
             if not admitted:
