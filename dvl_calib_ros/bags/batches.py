@@ -192,11 +192,11 @@ def _write_run(file: BinaryIO, held: list[BagMessage], channels: dict[Channel, i
 
 def _read_run(file: BinaryIO, at: int, end: int, channels: list[Channel]) -> Iterator[BagMessage]:
     """Yield a run from the file, read in parts, because all runs share the file."""
-    rest = b""
+    incomplete = b""
     while at < end:
         file.seek(at)
-        part = rest + file.read(min(_PART, end - at))
-        at += len(part) - len(rest)
+        part = incomplete + file.read(min(_PART, end - at))
+        at += len(part) - len(incomplete)
         offset = 0
         while offset + _HEAD.size <= len(part):
             log_ns, number, length = _HEAD.unpack_from(part, offset)
@@ -204,4 +204,4 @@ def _read_run(file: BinaryIO, at: int, end: int, channels: list[Channel]) -> Ite
                 break
             yield log_ns, channels[number], part[offset + _HEAD.size : offset + _HEAD.size + length]
             offset += _HEAD.size + length
-        rest = part[offset:]
+        incomplete = part[offset:]

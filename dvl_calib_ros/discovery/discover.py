@@ -106,7 +106,7 @@ class _Search:
     """One search; the findings are collected in attributes."""
 
     def __init__(self, seen: Survey, parameters: Parameters, given: Given, where: str) -> None:
-        self._seen, self._parameters, self._given, self._where = seen, parameters, given, where
+        self._survey, self._parameters, self._given, self._where = seen, parameters, given, where
         used = parameters.use_transforms
         self._tree = FrameTree.of(seen.transforms if used else (), seen.descriptions if used else ())
         self._values: dict[str, Any] = {}
@@ -120,7 +120,7 @@ class _Search:
     def run(self) -> Discovery:
         """Choose topics, then the frames of the DVL, if it has data."""
         topics = self._choose_topics()
-        looks = self._seen.looks
+        looks = self._survey.looks
         dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
         if dvl is not None:
             self._choose_frames(dvl, *(in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
@@ -141,11 +141,11 @@ class _Search:
     def _choose_topics(self) -> Topics:
         """Choose the three topics: given ones, otherwise by type, name and motion."""
         given, default = self._given, Topics()
-        dvl = self._checked("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._seen, default.dvl, self._where)
-        self._notes += topic_choice.other_dvls(self._seen, dvl, difference_of)
+        dvl = self._checked("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._survey, default.dvl, self._where)
+        self._notes += topic_choice.other_dvls(self._survey, dvl, difference_of)
         gnss, imu = default.gnss, default.imu
         if given.gnss_topic is None:
-            chosen, notes = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
+            chosen, notes = topic_choice.choose_reference(self._survey, default.gnss, dvl, difference_of)
             gnss = chosen or default.gnss
             self._notes += notes
         elif given.gnss_topic != NONE:
@@ -153,10 +153,10 @@ class _Search:
         else:
             gnss = NONE
         if given.imu_topic is None:
-            imu = topic_choice.choose_imu(self._seen, default.imu, gnss) or default.imu
+            imu = topic_choice.choose_imu(self._survey, default.imu, gnss) or default.imu
         else:
             imu = NONE if given.imu_topic == NONE else self._checked("imu", given.imu_topic) or imu
-        if imu.endswith(ORIENTATION) and imu in self._seen.topics:
+        if imu.endswith(ORIENTATION) and imu in self._survey.topics:
             self._found.append(
                 f"no IMU gives an attitude; it is the orientation of {imu.removesuffix(ORIENTATION)}, and turn rates "
                 "are its derivative"
@@ -168,18 +168,18 @@ class _Search:
         if name is None:
             return None
         return topic_choice.checked_topic(
-            f"--{role}-topic", name, topic_choice.wanted_types(role), self._seen, self._where
+            f"--{role}-topic", name, topic_choice.wanted_types(role), self._survey, self._where
         )
 
     def _describe_topics(self, topics: Topics) -> str:
         """Describe the chosen topics with type, frame and rate, for the first line of the output."""
         parts = []
         for role, name in (("DVL", topics.dvl), ("reference", topics.gnss), ("IMU", topics.imu)):
-            kind = self._seen.topics.get(name)
+            kind = self._survey.topics.get(name)
             if kind is None:
                 parts.append(f"no {role}")
                 continue
-            look = self._seen.looks.get(name)
+            look = self._survey.looks.get(name)
             rate = f", {look.rate_hz:.3g} Hz" if look is not None and look.rate_hz else ""
             frame = ""
             if role == "reference" and look is not None:
@@ -214,8 +214,8 @@ class _Search:
         self._lower_min_speed(dvl)
         if reference is not None:
             chosen = self._fit(frames, dvl, reference, imu, mounting, placed)
-        taken = frames.imu if chosen is None else chosen.imu
-        self._use_base_axes(taken is not None and taken.z_down)
+        imu_choice = frames.imu if chosen is None else chosen.imu
+        self._use_base_axes(imu_choice is not None and imu_choice.z_down)
         is_turned = frames.dvl_is_turned(self._is_z_down)
         if chosen is not None and reference is not None:
             agreement = self._chosen = chosen.agreement
@@ -225,8 +225,8 @@ class _Search:
             self._measure_noise(agreement, mounting, dvl, reference)
         elif reference is None:
             self._mounting_from_motion(dvl, is_turned, mounting)
-        if taken is not None:
-            self._use_imu(taken.frame)
+        if imu_choice is not None:
+            self._use_imu(imu_choice.frame)
         parameters = self._parameters.replace(base_axes=FRD if self._is_z_down else FLU)
         if parameters.dvl_axes == FROM_MESSAGE and is_turned != turns_dvl(
             VELOCITY_TYPES[dvl.msgtype], dvl.frame_id, parameters
@@ -276,10 +276,10 @@ class _Search:
 
     def _check_gravity(self, imu: Look) -> None:
         """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
-        gravity, taken = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
+        gravity, parameters = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
         if gravity is not None and (
             found := gravity.contradiction(
-                imu.topic, rotation_from_rpy(taken.imu_rpy), taken.imu_frame, taken.is_z_down
+                imu.topic, rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, parameters.is_z_down
             )
         ):
             self._contradictions.append(found)
@@ -354,8 +354,8 @@ class _Search:
         """Return the assumed frame of the reference; None without one, or if unknown."""
         if reference is None:
             return None
-        taken = self._values.get("gnss_frame")
-        declared = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
+        chosen_name = self._values.get("gnss_frame")
+        declared = self._declared_reference(reference) if chosen_name is None else DECLARED_FRAMES[chosen_name]
         return None if declared is None else declared.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
@@ -392,12 +392,12 @@ class _Search:
         declared = self._declared_reference(reference)
         if declared is not None:
             declared = declared.in_base(FRD if self._is_z_down else FLU)
-        taken = DECLARED_FRAMES[reading.reference]
+        chosen_frame = DECLARED_FRAMES[reading.reference]
         # without an attitude only the body frame could be tried
         if imu is None and declared is None and chosen.best_residual >= MAX_RESIDUAL:
             self._notes.append(finding("REFERENCE_FRAME_NOT_TOLD", topic=reference.topic))
-        elif taken != declared:
-            name = self._values["gnss_frame"] = taken.name
+        elif chosen_frame != declared:
+            name = self._values["gnss_frame"] = chosen_frame.name
             if declared is None:
                 self._found.append(
                     f"the reference is used as {name}, which fits best; its frame {reference.frame_id!r} does not "

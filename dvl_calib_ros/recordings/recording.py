@@ -282,8 +282,8 @@ def _renumbered(each: Sequence[Recording], names: Collection[str]) -> dict[str, 
         new_arrivals = new_arrival[at : at + len(arrival)]
         at += len(arrival)
 
-        def renumbered(of: Stamps, arrival: Stamps = arrival, new_arrivals: Stamps = new_arrivals) -> Stamps:
-            return np.asarray(new_arrivals[np.searchsorted(arrival, of)])
+        def renumbered(old_arrivals: Stamps, arrival: Stamps = arrival, new_arrivals: Stamps = new_arrivals) -> Stamps:
+            return np.asarray(new_arrivals[np.searchsorted(arrival, old_arrivals)])
 
         for name, parts in one.columns.items():
             columns[name] += [part.arriving(renumbered) for part in parts]

@@ -94,8 +94,8 @@ class _Cut:
 
     def newest_ns(self, index: int) -> int:
         """Return the log time of the last message up to the end of this stretch; 0 without any."""
-        both = (self._part.laid, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
-        return max(int(each.log_ns[end - 1]) if end else 0 for each, end in both)
+        ends = (self._part.laid, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
+        return max(int(each.log_ns[end - 1]) if end else 0 for each, end in ends)
 
 
 def _block(
@@ -182,9 +182,9 @@ def _turned(axes: Axes, values: Array, covariances: Covariances, which: Mask) ->
     if which.all():
         return axes.velocity(values), Covariances(rotated, covariances.index)
     n = len(covariances.distinct)
-    both = np.concatenate([covariances.distinct, rotated])
+    distinct = np.concatenate([covariances.distinct, rotated])
     index = np.where(which & (covariances.index >= 0), covariances.index + n, covariances.index)
-    return np.where(which[:, None], axes.velocity(values), values), Covariances(both, index.astype(np.intp))
+    return np.where(which[:, None], axes.velocity(values), values), Covariances(distinct, index.astype(np.intp))
 
 
 def _imu(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:

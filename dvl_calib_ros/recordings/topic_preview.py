@@ -159,12 +159,12 @@ def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
     return rates[-1] if min(abs(math.log(rate)) for rate in rates) > SIMULATED_TIME else 1.0
 
 
-def _places(arrival: Stamps, taken: Stamps) -> Index:
+def _places(arrival: Stamps, chosen: Stamps) -> Index:
     """Return the indices of rows, in order of arrival, that are among those taken."""
-    if not len(arrival) or not len(taken):
+    if not len(arrival) or not len(chosen):
         return np.zeros(0, dtype=np.intp)
-    matching = np.minimum(np.searchsorted(arrival, taken), len(arrival) - 1)
-    return np.asarray(matching[arrival[matching] == taken])
+    matching = np.minimum(np.searchsorted(arrival, chosen), len(arrival) - 1)
+    return np.asarray(matching[arrival[matching] == chosen])
 
 
 def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]) -> Stamps:

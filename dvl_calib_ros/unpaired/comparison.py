@@ -365,9 +365,9 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
     noise = [_noise(each, float(adjusted)) for each, adjusted in zip(candidates, p[len(compared.p) :], strict=True)]
     noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
     status = {each.name: each.status for each in found}
-    both = {name: (*compared.sizes[name], status[name]) for name in compared.p}
+    compared_sizes = {name: (*compared.sizes[name], status[name]) for name in compared.p}
     own_effects = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
-    shrunk = shrink(vehicle, simulator, models(both, own_effects))
+    shrunk = shrink(vehicle, simulator, models(compared_sizes, own_effects))
     levels = [levels_by_regime(log) for log in (vehicle, simulator)]
     verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
     return UnpairedComparison(

@@ -97,8 +97,8 @@ def compared_names(vehicle: Size, simulator: Size) -> list[str]:
     A side without the second occurrence has 0 for it.
     """
     own = [*dict.fromkeys([*vehicle.names, *simulator.names])]
-    again = vehicle.effect.again if vehicle.found and simulator.found else ()
-    return [name for name in own if name in again or (name in vehicle.names and name in simulator.names)]
+    second_occurrence = vehicle.effect.again if vehicle.found and simulator.found else ()
+    return [name for name in own if name in second_occurrence or (name in vehicle.names and name in simulator.names)]
 
 
 def p_alike(vehicle: Size, simulator: Size) -> float:
@@ -154,10 +154,10 @@ def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str
 
 def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]:
     """Return the names to compare. Of three clocks only two differences are observable, so the third is omitted."""
-    both = {*vehicle.values(), *simulator.values()}
-    if set(CLOCKS) <= both:
-        both.discard(ATTITUDE_CLOCK)
-    return [name for name in EFFECTS if name in both] + sorted(both - set(EFFECTS))
+    names = {*vehicle.values(), *simulator.values()}
+    if set(CLOCKS) <= names:
+        names.discard(ATTITUDE_CLOCK)
+    return [name for name in EFFECTS if name in names] + sorted(names - set(EFFECTS))
 
 
 def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:

@@ -265,8 +265,8 @@ def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generat
     """Return the energy distance of two series' windows (N, 3), its 95 per cent quantile if both are alike, and p."""
     a, b = features(one, windows), features(other, windows)
     scale = np.maximum(robust_std(np.concatenate([a, b])), 1e-9)
-    both = np.concatenate([a, b]) / scale
-    distances = np.linalg.norm(both[:, None] - both[None], axis=2)
+    pooled = np.concatenate([a, b]) / scale
+    distances = np.linalg.norm(pooled[:, None] - pooled[None], axis=2)
     n_windows = len(a)
     if n_windows < 4:
         return np.nan, np.nan, np.nan

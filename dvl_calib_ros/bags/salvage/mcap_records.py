@@ -351,16 +351,16 @@ def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) 
     return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
 
 
-def _definitions_between(records: bytes, here: int, end: int) -> list[tuple[int, bytes]] | None:
+def _definitions_between(records: bytes, start: int, end: int) -> list[tuple[int, bytes]] | None:
     """Return opcode and content of the schemas and channels between two positions; None if there is anything else."""
     found = []
-    while here + RECORD_HEAD.size <= end:
-        opcode, length = RECORD_HEAD.unpack_from(records, here)
-        if opcode not in (SCHEMA, CHANNEL) or here + RECORD_HEAD.size + length > end:
+    while start + RECORD_HEAD.size <= end:
+        opcode, length = RECORD_HEAD.unpack_from(records, start)
+        if opcode not in (SCHEMA, CHANNEL) or start + RECORD_HEAD.size + length > end:
             return None
-        found.append((opcode, records[here + RECORD_HEAD.size : here + RECORD_HEAD.size + length]))
-        here += RECORD_HEAD.size + length
-    return found if here == end else None
+        found.append((opcode, records[start + RECORD_HEAD.size : start + RECORD_HEAD.size + length]))
+        start += RECORD_HEAD.size + length
+    return found if start == end else None
 
 
 def messages_of(

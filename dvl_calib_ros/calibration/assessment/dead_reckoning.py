@@ -229,16 +229,16 @@ class _Level(NamedTuple):
         # intermediate arrays take twenty times the memory
         for start in range(0, len(rows), COMPARED_AT_ONCE):
             part = rows[start : start + COMPARED_AT_ONCE]
-            seen = recording.compared(part, terms, parameters)
-            self.oriented[part] = seen.oriented
-            rotation = seen.rotation_enu_from_body
+            data = recording.compared(part, terms, parameters)
+            self.oriented[part] = data.oriented
+            rotation = data.rotation_enu_from_body
             self.yaw[part] = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-            self.in_body[part] = seen.error
-            for table, column in zip(self.whole, (rotation, seen.body, seen.error, seen.rates), strict=False):
+            self.in_body[part] = data.error
+            for table, column in zip(self.whole, (rotation, data.body, data.error, data.rates), strict=False):
                 table[part] = column
-            for columns, body in ((self.velocity, seen.body), (self.error, seen.error)):
+            for columns, body in ((self.velocity, data.body), (self.error, data.error)):
                 columns[part, :2] = body[:, :2]
-                columns[part, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]
+                columns[part, 2:] = np.matmul(data.rotation_enu_from_body, body[..., None])[:, :2, 0]
 
 
 def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Parameters) -> ResidualTrend | None:

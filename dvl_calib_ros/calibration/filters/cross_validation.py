@@ -155,13 +155,13 @@ class Moments(FoldSums):
     def __init__(self) -> None:
         super().__init__((), (3, 3, 3), (3, 3), (), ())
 
-    def take(self, folds: NDArray[np.int64], seen: Observations) -> None:
+    def take(self, folds: NDArray[np.int64], observations: Observations) -> None:
         """Add N samples."""
-        assert seen.reference_body is not None
-        v, g = seen.velocity_at_reference, seen.reference_body
-        measured = np.broadcast_to(seen.measured_in_body, v.shape)
-        rotation = seen.rotation_dvl_from_body
-        variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, seen.noise, rotation), v.shape)
+        assert observations.reference_body is not None
+        v, g = observations.velocity_at_reference, observations.reference_body
+        measured = np.broadcast_to(observations.measured_in_body, v.shape)
+        rotation = observations.rotation_dvl_from_body
+        variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, observations.noise, rotation), v.shape)
         for fold in set(folds.tolist()):
             is_in_fold = folds == fold
             velocity, is_measured = v[is_in_fold], measured[is_in_fold]

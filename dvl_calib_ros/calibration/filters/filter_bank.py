@@ -134,7 +134,7 @@ class Group:
         self._restarted = np.zeros(k, dtype=np.int64)
 
     def update(
-        self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
+        self, stamps_ns: Stamps, observations: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
     ) -> Snapshot | None:
         """Update by a block of N samples that meet the needs. Return the states after `ends` samples (E), if given.
 
@@ -142,8 +142,8 @@ class Group:
         """
         self.n_given += len(stamps_ns)
         if self._height is not None:
-            seen = replace(seen, height=self._height.add(stamps_ns, seen.rising))
-        measurements = self._assembler.measurements(seen, weight, prior_known)
+            observations = replace(observations, height=self._height.add(stamps_ns, observations.rising))
+        measurements = self._assembler.measurements(observations, weight, prior_known)
         process = self._process_noise(stamps_ns)
         cuts = np.zeros(0, dtype=np.intp)
         if self._scatter is not None:
@@ -161,16 +161,16 @@ class Group:
             folds = folds_of(stamps_ns, self._parameters)
             self._folds.add(folds, measurements, after.used)
             if self.needs is Needs.REFERENCE:
-                self.moments.take(folds, seen)
+                self.moments.take(folds, observations)
         snapshot = None if ends is None or all_ends is None else self._snapshot_at(after, ends, all_ends)
         n_used = after.used.sum(axis=1)
         self._used += n_used
         self._gated += measurements.usable.sum(axis=1) - n_used
         self._nis_sum += np.einsum("kn,kn->k", after.used, after.nis)
-        if seen.unmeasured is None:
+        if observations.unmeasured is None:
             self._rows_sum += n_used * measurements.z.shape[2]
         else:
-            self._rows_sum += (after.used * self._assembler.rows_left(seen.unmeasured)).sum(axis=1)
+            self._rows_sum += (after.used * self._assembler.rows_left(observations.unmeasured)).sum(axis=1)
         return snapshot
 
     def end_day(self) -> None:

@@ -179,8 +179,8 @@ class MotionFit:
 
     def __call__(
         self,
-        reference: float,
-        apart: float,
+        rho: float,
+        delta: float,
         rotation_body_from_dvl: Array | None,
         in_time: Sequence[Array] = (),
         among: Fitted | None = None,
@@ -190,17 +190,17 @@ class MotionFit:
 
         Parameters
         ----------
-        reference, apart: Initial ρ and δ, s.
+        rho, delta: Initial ρ and δ, s.
         rotation_body_from_dvl: (3, 3) prior mounting; None to estimate it.
         in_time: Rows of synchronised clocks (`DVL`, `REFERENCE`, `BOTH_ALIKE`); REFERENCE is added without an attitude.
         among: Another fit, to compare only its references, DVL samples and attitudes.
         most: Residual per axis (m/s) above which a fit that hardly improves is given up.
         """
-        rotation = self._best_rotation(reference, apart) if rotation_body_from_dvl is None else rotation_body_from_dvl
+        rotation = self._best_rotation(rho, delta) if rotation_body_from_dvl is None else rotation_body_from_dvl
         if rotation is None:
             return None
         x = np.zeros(N)
-        x[DELTA], x[RHO] = apart, reference
+        x[DELTA], x[RHO] = delta, rho
         nominal = rotation
         solved = None
         if not self.is_turned:
@@ -281,22 +281,22 @@ class MotionFit:
             return np.asarray(columns)
         return np.asarray((attitude @ columns if self._motion.in_earth else columns)[:, measured])
 
-    def _interpolated(self, reference: float, apart: float, among: Fitted | None = None) -> _Compared | None:
+    def _interpolated(self, rho: float, delta: float, among: Fitted | None = None) -> _Compared | None:
         """Return the compared references (J,) and their streams at delays ρ and δ, or None for too few.
 
         Streams: B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), slope noise gain (J,).
         """
         m = self._motion
-        body_at = self.times - reference
+        body_at = self.times - rho
         if m.in_earth and not m.has_attitude:
             return None
-        velocity, slope, gain, known = self._curves.velocity(self.times + apart)
+        velocity, slope, gain, known = self._curves.velocity(self.times + delta)
         needed = m.in_earth or not all(m.measured)
         rotation, oriented = attitude_at(m.imu, body_at, GAP_S) if needed else (np.zeros((len(body_at), 3, 3)), known)
         if m.in_earth:
             known = known & oriented
         if among is not None:
-            known = known & self._shared(among, reference, apart)
+            known = known & self._shared(among, rho, delta)
         if np.count_nonzero(known) < FEWEST_SAMPLES:
             return None
         rows = np.flatnonzero(known)
@@ -304,18 +304,18 @@ class MotionFit:
         body = np.einsum("nji,nj->ni", rotation, reference_velocity) if m.in_earth else reference_velocity
         return rows, (body, self._curves.rates(body_at[rows]), velocity[rows], slope[rows], rotation, gain[rows])
 
-    def _shared(self, other: Fitted, reference: float, apart: float) -> Mask:
+    def _shared(self, other: Fitted, rho: float, delta: float) -> Mask:
         """Return a mask (J,) of references whose DVL samples and attitudes another fit compares, too."""
         other_times, shared = self.times[other.at], np.zeros(len(self.times), dtype=bool)
         shared[other.at] = True
-        for delay, other_delay in ((apart, float(other.x[DELTA])), (-reference, -float(other.x[RHO]))):
+        for delay, other_delay in ((delta, float(other.x[DELTA])), (-rho, -float(other.x[RHO]))):
             shifted = self.times + delay
             shared &= (shifted >= other_times[0] + other_delay) & (shifted <= other_times[-1] + other_delay)
         return shared
 
-    def _best_rotation(self, reference: float, apart: float) -> Array | None:
+    def _best_rotation(self, rho: float, delta: float) -> Array | None:
         """Return the least-squares rotation C (3, 3) at delays ρ and δ (s), without lever arm."""
-        streams = self._interpolated(reference, apart)
+        streams = self._interpolated(rho, delta)
         if streams is None:
             return None
         _, (body, _, velocity, *_) = streams

@@ -275,13 +275,13 @@ def _fewest_delayed_clocks(
 
     free: fit with both delays free. synchronised: result of `_fit_in_sync` for no delayed clock.
     """
-    apart = float(free.x[DELTA])
-    dvl_penalty, ref_penalty = (EARLY_PENALTY, 0.0) if apart < 0.0 else (0.0, EARLY_PENALTY)
+    delta = float(free.x[DELTA])
+    dvl_penalty, ref_penalty = (EARLY_PENALTY, 0.0) if delta < 0.0 else (0.0, EARLY_PENALTY)
     tried = {_Delayed.NONE: synchronised}
     if tried[_Delayed.NONE][1] >= IN_SYNC_CHI2:
         tried |= {
-            _Delayed.DVL: _fit_in_sync(fit, free, rotation, 0.0, apart, (REFERENCE,), GAIN_PER_CLOCK + dvl_penalty),
-            _Delayed.REFERENCE: _fit_in_sync(fit, free, rotation, -apart, apart, (DVL,), GAIN_PER_CLOCK + ref_penalty),
+            _Delayed.DVL: _fit_in_sync(fit, free, rotation, 0.0, delta, (REFERENCE,), GAIN_PER_CLOCK + dvl_penalty),
+            _Delayed.REFERENCE: _fit_in_sync(fit, free, rotation, -delta, delta, (DVL,), GAIN_PER_CLOCK + ref_penalty),
             _Delayed.IMU: _fit_in_sync(fit, free, rotation, float(free.x[RHO]), 0.0, (BOTH_ALIKE,), GAIN_PER_CLOCK),
         }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
@@ -346,8 +346,8 @@ def _fit_in_sync(
     fit: MotionFit,
     free: Fitted,
     rotation: Array | None,
-    reference: float = 0.0,
-    apart: float = 0.0,
+    rho: float = 0.0,
+    delta: float = 0.0,
     held_clocks: tuple[Array, ...] = (DVL, REFERENCE),
     costs: float = 0.0,
 ) -> tuple[Fitted | None, float]:
@@ -355,7 +355,7 @@ def _fit_in_sync(
 
     held_clocks: rows that select the synchronised clocks. Without a possible fit: None and infinity.
     """
-    held = fit(reference, apart, rotation, held_clocks)
+    held = fit(rho, delta, rotation, held_clocks)
     if held is None or not _is_possible(held):
         return None, math.inf
     # the number of compared samples depends on the delays
