@@ -151,9 +151,8 @@ def _scores(e: Evaluation) -> Iterable[Item]:
         )
     yield Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
     base = e.columns.index(UNCALIBRATED)
-    gains, gains_published = (
-        1.0 - e.of_models(vrmse) / vrmse[:, [base]] for vrmse in (e.seed_mean, e.published_of_these)
-    )
+    both_vrmse = (e.seed_mean, e.published_of_these)
+    gains, gains_published = (1.0 - e.of_models(vrmse) / vrmse[:, [base]] for vrmse in both_vrmse)
     text = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gains.mean(axis=0), strict=True))
     yield figure(
         "evaluation_figures.improvement_bars",

@@ -271,10 +271,7 @@ def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: A
 def _fewest_delayed_clocks(
     fit: MotionFit, free: Fitted, synchronised: tuple[Fitted | None, float], rotation: Array | None, lever_arm: Array
 ) -> Registration:
-    """Explain a fit by the fewest delayed clocks: none, one of three, or DVL and reference.
-
-    free: fit with both delays free. synchronised: result of `_fit_in_sync` for no delayed clock.
-    """
+    """Explain a fit with free delays by the fewest delayed clocks: none (synchronised), one of three, or two."""
     delta = float(free.x[DELTA])
     dvl_penalty, ref_penalty = (EARLY_PENALTY, 0.0) if delta < 0.0 else (0.0, EARLY_PENALTY)
     tried = {_Delayed.NONE: synchronised}

@@ -30,8 +30,7 @@ from .stream_order import LONG_AGO_NS, Admitted, Sequencer, Track
 class ScreenedStreams(NamedTuple):
     """Columns of all streams, masks of the valid rows, and the screened values.
 
-    dvl_covariance: (N, 3, 3). reference_values: (J, 12) velocity and covariance. reference_unmeasured: (J,) see
-    `Screened`. imu_values: (M, 7) quaternion and angular velocity.
+    reference_values: (J, 12) velocity and covariance. imu_values: (M, 7) quaternion and angular velocity.
     """
 
     streams: Streams
