@@ -60,18 +60,18 @@ class Batch(NamedTuple):
     def begin_with(self, magic: bytes) -> NDArray[np.bool_]:
         """Return which messages (N,) begin with these bytes."""
         found = np.zeros(self.size, dtype=bool)
-        at = np.flatnonzero(self.end - self.start >= len(magic))
+        candidates = np.flatnonzero(self.end - self.start >= len(magic))
         content = np.frombuffer(self.content, dtype=np.uint8)
-        for place, byte in enumerate(magic):
-            at = at[content[self.start[at] + place] == byte]
-        found[at] = True
+        for position, byte in enumerate(magic):
+            candidates = candidates[content[self.start[candidates] + position] == byte]
+        found[candidates] = True
         return found
 
     def rows(self, at: Index, length: int) -> NDArray[Any]:
         """Return a copy of messages of one length above zero, as (M,) items of that many bytes."""
         item = np.dtype(("V", length))
-        everywhere = np.ndarray((len(self.content) - length + 1,), item, self.content, strides=(1,))
-        return everywhere[self.start[at]]  # `take` would first copy all overlapping items
+        overlapping = np.ndarray((len(self.content) - length + 1,), item, self.content, strides=(1,))
+        return overlapping[self.start[at]]  # `take` would first copy all overlapping items
 
     def compact(self) -> Batch:
         """Return the batch without unused bytes."""
@@ -192,11 +192,11 @@ def _write_run(file: BinaryIO, held: list[BagMessage], channels: dict[Channel, i
 
 def _read_run(file: BinaryIO, at: int, end: int, channels: list[Channel]) -> Iterator[BagMessage]:
     """Yield a run from the file, read in parts, because all runs share the file."""
-    rest = b""
+    incomplete = b""
     while at < end:
         file.seek(at)
-        part = rest + file.read(min(_PART, end - at))
-        at += len(part) - len(rest)
+        part = incomplete + file.read(min(_PART, end - at))
+        at += len(part) - len(incomplete)
         offset = 0
         while offset + _HEAD.size <= len(part):
             log_ns, number, length = _HEAD.unpack_from(part, offset)
@@ -204,4 +204,4 @@ def _read_run(file: BinaryIO, at: int, end: int, channels: list[Channel]) -> Ite
                 break
             yield log_ns, channels[number], part[offset + _HEAD.size : offset + _HEAD.size + length]
             offset += _HEAD.size + length
-        rest = part[offset:]
+        incomplete = part[offset:]

@@ -128,10 +128,10 @@ def _kinds(batch: Batch) -> Iterator[tuple[int, int, Index]]:
     """Yield channel number and length of messages, with the indices (M,) of such messages, by first occurrence."""
     kinds = batch.number + ((batch.end - batch.start) << 16)
     order = np.argsort(kinds, kind="stable")
-    of_each = np.split(order, np.flatnonzero(np.diff(kinds[order])) + 1)
-    for at in sorted(of_each, key=lambda at: int(at[0])):
-        kind = int(kinds[at[0]])
-        yield kind & 0xFFFF, kind >> 16, at
+    groups = np.split(order, np.flatnonzero(np.diff(kinds[order])) + 1)
+    for group in sorted(groups, key=lambda group: int(group[0])):
+        kind = int(kinds[group[0]])
+        yield kind & 0xFFFF, kind >> 16, group
 
 
 class _Layouts:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("result", nargs="?", type=Path, metavar="RESULT", help="result file of the node or of replay")
-    parser.add_argument("--urdf", type=Path, metavar="FILE", help="turn, and move, the DVL's joint in this URDF")
+    parser.add_argument("--urdf", type=Path, metavar="FILE", help="rotate and move the DVL's joint in this URDF")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint; default: the one above the DVL's frame")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the URDF here, do not change --urdf")
     parser.add_argument("--keep-position", action="store_true", help="do not change the DVL's xyz in the URDF")
@@ -56,7 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--force", action="store_true", help="apply a result that is rejected, not converged, or of another mounting"
     )
     parser.add_argument(
-        "--rollback", action="store_true", help="restore the files from before the last apply (again: undo that)"
+        "--rollback",
+        action="store_true",
+        help="restore the files from before the last apply; a second time undoes that",
     )
 
 
@@ -90,14 +92,14 @@ def run(arguments: argparse.Namespace) -> None:
     applied = write_calibration(calibrated, targets, arguments.force, arguments.dry_run)
     show(*(f"note: {note}" for note in applied.notes))
     is_refused = calibrated.objections and not arguments.force
-    refused = ["not to be applied, see the warnings; --force shows and writes it anyway"]
+    refused = ["this calibration should not be applied, see the warnings; --force shows and writes it anyway"]
     _print_lines(calibrated, refused if is_refused else _mounting_lines(calibrated))
     if arguments.dry_run:
         show(*(applied.changes.splitlines() or ["nothing would change"]))
         return
     for path in targets.paths:
         before = f"; the one before is {applied.kept[path].name}" if path in applied.kept else ""
-        show(f"{path}: written{before}" if path in applied.written else f"{path}: is so already")
+        show(f"{path}: written{before}" if path in applied.written else f"{path}: already up to date")
 
 
 def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
@@ -105,13 +107,13 @@ def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Nam
     from ..disk.atomic import save_bytes
     from ..instruments.settings import AS_RECORDED, configure, instrument_settings
 
-    now = _parse_now(arguments.now)
-    chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)
-    untold = [each.name for each in chosen.settings if each.name not in now and each.now_by != AS_RECORDED]
-    if arguments.send and (arguments.instrument != "waterlinked" or untold):
+    known = _parse_now(arguments.now)
+    chosen = instrument_settings(calibrated, arguments.instrument, known, arguments.force)
+    missing = [each.name for each in chosen.settings if each.name not in known and each.now_by != AS_RECORDED]
+    if arguments.send and (arguments.instrument != "waterlinked" or missing):
         raise InputError(
             "--send is for waterlinked, and needs its settings when the data were recorded: "
-            + " ".join(f"--now {name}=..." for name in untold or ("mounting_rotation_offset",))
+            + " ".join(f"--now {name}=..." for name in missing or ("mounting_rotation_offset",))
         )
     _print_lines(calibrated, _settings_lines(chosen))
     if arguments.settings and not arguments.dry_run:
@@ -120,7 +122,7 @@ def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Nam
     if arguments.send:
         is_so = configure(arguments.send, chosen.settings, arguments.dry_run)
         done = "would be set" if arguments.dry_run else "set, and read back"
-        show(f"{arguments.send}: {'is so already' if is_so else done}")
+        show(f"{arguments.send}: {'already up to date' if is_so else done}")
 
 
 def _parse_now(words: Sequence[str]) -> dict[str, float]:
@@ -155,9 +157,9 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
 
     angles = near_angles(calibrated.rpy, calibrated.parameters.mounting_rpy)  # as in the report, 180.4° not -179.6°
     degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(angles))
-    known = calibrated.position is not None
+    is_known = calibrated.position is not None
     transform = (
-        f"ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}" if known else POSITION_UNKNOWN
+        f"ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}" if is_known else POSITION_UNKNOWN
     )
     lines = [
         f"{calibrated.model.name}: {calibrated.dvl_frame} in {calibrated.base_frame} at roll, pitch, yaw {degrees}",
@@ -168,8 +170,8 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     if calibrated.cause_of_scale is not None:
         lines.append(f"water:  {calibrated.cause_of_scale.sentence}")
     if any(calibrated.lever_arm):
-        found = "found" if calibrated.lever_arm_found else "as lever_arm says"
-        lines.append(f"lever arm: {_metres(calibrated.lever_arm)} from the reference point, {found}")
+        source = "found" if calibrated.lever_arm_found else "as lever_arm says"
+        lines.append(f"lever arm: {_metres(calibrated.lever_arm)} from the reference point, {source}")
     if calibrated.dvl_time_offset:
         way = "late" if calibrated.dvl_time_offset > 0.0 else "early"
         lines.append(

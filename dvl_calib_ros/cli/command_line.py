@@ -56,14 +56,14 @@ def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"dvl-calib {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     for command in COMMANDS:
-        of_it = commands.add_parser(
+        subparser = commands.add_parser(
             command.name, help=command.help, epilog=f"example: {command.example}", formatter_class=_Formatter
         )
         if command.name in argv:
             module = command.load()
-            of_it.description = (module.__doc__ or "").strip()
-            of_it.set_defaults(run=module.run)
-            module.add_arguments(of_it)
+            subparser.description = (module.__doc__ or "").strip()
+            subparser.set_defaults(run=module.run)
+            module.add_arguments(subparser)
     return parser
 
 
@@ -177,8 +177,8 @@ def recordings_now(arguments: argparse.Namespace) -> dict[Path, State]:
 def changed(before: Mapping[Path, State], after: Mapping[Path, State]) -> list[str]:
     """Return a warning for every recording that changed or vanished."""
     return [
-        f"{path}: changed while it was read, so the answer may be of a part of it, or of two recordings; run this "
-        "again when nothing writes to it any more"
+        f"{path}: changed while it was read, so the answer may describe only a part of it; run this again when "
+        "nothing writes to it any more"
         for path, state in before.items()
         if after.get(path) != state
     ]

@@ -56,7 +56,7 @@ COMMANDS = (
     Command("salvage", "recover damaged recordings into a new bag", "dvl-calib salvage cut_off_bag -o whole_bag"),
     Command(
         "apply",
-        "write a saved calibration into URDF, parameters, TF, robot_localization or the instrument, or take it back",
+        "write a saved calibration into URDF, parameters, TF, robot_localization or the instrument, or undo that",
         "dvl-calib apply calibration.yaml --urdf robot.urdf --launch dvl_tf.launch.xml --fusion dvl_ekf.yaml",
     ),
     Command(
@@ -71,12 +71,12 @@ COMMANDS = (
     ),
     Command(
         "diagnose",
-        "name what causes the velocity error that calibration leaves in recorded bags",
+        "find what causes the velocity error that remains in recorded bags after calibration",
         "dvl-calib diagnose my_bag --apply compensated.yaml",
     ),
     Command(
         "export",
-        "write what was found of a DVL as the settings of another simulator",
+        "write a diagnosed DVL as the settings of another simulator",
         "dvl-calib export gazebo diagnosis.json -o dvl.sdf",
     ),
     Command(

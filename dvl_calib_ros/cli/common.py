@@ -298,10 +298,7 @@ def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
 
 def share_folder() -> Path:
     """Return the folder of bags/ and config/: the source tree or share/dvl_calib_ros. Raises InputError."""
-    candidates = [
-        Path(__file__).resolve().parents[2],
-        Path(sys.prefix) / "share" / "dvl_calib_ros",
-    ]
+    candidates = [Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "dvl_calib_ros"]
     try:
         from ament_index_python.packages import get_package_share_directory
 

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
-    of_each = _apply_paths(arguments.apply, names)
+    paths_by_recording = _apply_paths(arguments.apply, names)
     count, sampled = _samples(arguments.samples)
     common.check_outputs(
         arguments,
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         "apply",
         "report",
         folders=["twin"],
-        also_written={f"--apply of {name}": path for name, path in of_each.items()}
+        also_written={f"--apply of {name}": path for name, path in paths_by_recording.items()}
         | ({} if sampled is None else {"--samples": sampled}),
     )
     _check_twins(arguments.twin, names)
@@ -109,17 +109,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     def apply(path: Path) -> None:
         """Write the parameters that correct the diagnosed errors, per recording if they differ."""
-        days: dict[int | None, Path] = {None: path}
+        paths: dict[int | None, Path] = {None: path}
         if any(effect.by_recording for effect in diagnosis.effects):
-            days |= {index: of_each[name] for index, (name, _) in enumerate(diagnosis.recordings)}
+            paths |= {index: paths_by_recording[name] for index, (name, _) in enumerate(diagnosis.recordings)}
         try:
-            found = verified_corrections(parameters, diagnosis, [*days])
+            corrections = verified_corrections(parameters, diagnosis, [*paths])
         except InputError as error:
             raise InputError(f"--apply {path}: {error}") from None
-        save_all({days[day]: parameter_file(each.parameters).encode() for day, each in found.items()})
-        written.extend(
-            f"wrote {days[day]}: {each.sentence}" for day, each in found.items() if own_stream(days[day]) is None
-        )
+        save_all({paths[day]: parameter_file(each.parameters).encode() for day, each in corrections.items()})
+        files = {day: each for day, each in corrections.items() if own_stream(paths[day]) is None}
+        written.extend(f"wrote {paths[day]}: {each.sentence}" for day, each in files.items())
 
     def write_all_twins(folder: Path) -> None:
         for twin in diagnosis.twins:

@@ -23,9 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("simulator", choices=tuple(SIMULATORS), metavar="SIMULATOR", help=", ".join(SIMULATORS))
     parser.add_argument(
-        "source", type=Path, metavar="DIAGNOSIS", help="what diagnose --json wrote; or a result or parameter file"
+        "source", type=Path, metavar="DIAGNOSIS", help="file of diagnose --json, or a result or parameter file"
     )
-    parser.add_argument("--sample", type=int, metavar="N", help="take a draw of diagnose --samples, from 0")
+    parser.add_argument("--sample", type=int, metavar="N", help="use this sample of diagnose --samples, from 0")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="settings to write")
 
 

@@ -17,7 +17,7 @@ from . import common
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("places", nargs="+", metavar="PLACE", help="folder, file, or URL such as s3://bucket/dives")
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="the catalogue, made or gone on with")
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="catalogue to create or to continue")
     parser.add_argument(
         "--vehicle-from",
         metavar="PATTERN",

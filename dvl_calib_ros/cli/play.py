@@ -122,7 +122,7 @@ def _check_arguments(arguments: argparse.Namespace) -> None:
 
 
 def _description(bag: BagReader, static: Sequence[str], played: Mapping[str, str]) -> str:
-    """Return the recorded description, if it is played, with the transforms of these topics as further joints."""
+    """Return the URDF to publish: the recorded one, if played, with the transforms of `static` topics as joints."""
     from ..discovery.transforms import FrameTree
     from ..recordings.recording import MOST_STATIC
 

@@ -347,14 +347,14 @@ class Keys:
         self._listener = listener
         self._ends_node = ends_node
         self._asked_s = -SURE_S
-        self._own = ""
+        self._question = ""
         self._is_leaving = False
         self.page = 0
 
     @property
     def last_answer(self) -> str:
         """Last answer."""
-        return self._own or self._listener.answer
+        return self._question or self._listener.answer
 
     def press(self, key: str, now_s: float) -> bool:
         """Execute a key. Return False to leave the view."""
@@ -362,11 +362,11 @@ class Keys:
         self._asked_s = now_s if key == "r" and not is_sure else -SURE_S
         self.page += key == "w"
         if self._is_leaving:
-            if key == "y" and self._own:
-                self._own = ""
+            if key == "y" and self._question:
+                self._question = ""
                 self._listener.call("save_anyway")
             return key not in ("n", "q")
-        self._own = "press r again to forget all that was learnt" if key == "r" and not is_sure else ""
+        self._question = "press r again to forget all that was learnt" if key == "r" and not is_sure else ""
         if key == "s" or (key == "q" and self._ends_node):
             self._listener.call("save")
         elif is_sure:
@@ -375,15 +375,15 @@ class Keys:
         return key != "q" or self._ends_node
 
     def has_left(self) -> bool:
-        """Return whether the program may end after q: the node has answered the save, and no question is open.
+        """Return whether the program may end after q: the node has answered, and no question is open.
 
-        If the saved result is better, ask whether to replace it.
+        Asks the question whether to replace a better saved result, so call it repeatedly.
         """
-        if not self._is_leaving or self._listener.is_waiting or self._own:
+        if not self._is_leaving or self._listener.is_waiting or self._question:
             return False
         if WORSE not in self._listener.answer:
             return True
-        self._own = f"replace the better result? (y/n)  {self._listener.answer}"
+        self._question = f"replace the better result? (y/n)  {self._listener.answer}"
         return False
 
 

@@ -68,34 +68,34 @@ def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None
     rates = angular_velocity_at(TurnRates.of(imu), times, GAP_S)
     known = known & np.isfinite(rates).all(axis=1) & np.isfinite(velocity).all(axis=1)
     times, velocity, rate, rotation = times[known], velocity[known], rates[known, 2], rotation[known]
-    ahead, up = rotation[:, :2, 0], float(np.sign(rotation[:, 2, 2].mean()))
-    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
+    heading, up = rotation[:, :2, 0], float(np.sign(rotation[:, 2, 2].mean()))
+    heading = heading / np.maximum(np.linalg.norm(heading, axis=1), 1e-9)[:, None]
     after = np.searchsorted(times, times + OVER_S - 1e-6)
     before = np.flatnonzero(after < len(times))
     after = after[before]
-    turns = (times[after] - times[before] < 1.5 * OVER_S) & (
-        np.linalg.norm(ahead[after] - ahead[before], axis=1) > TURNED_FROM
+    is_turn = (times[after] - times[before] < 1.5 * OVER_S) & (
+        np.linalg.norm(heading[after] - heading[before], axis=1) > TURNED_FROM
     )
-    before, after = before[turns], after[turns]
+    before, after = before[is_turn], after[is_turn]
     if len(before) < FEWEST_TURNS:
         return None
-    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    port = np.column_stack([-heading[:, 1], heading[:, 0]])
     # nuisance: misalignment, lever arm, skid
-    of_sway = np.column_stack([left, velocity[:, 0], rate, rate * velocity[:, 0]])
-    current = np.linalg.lstsq(of_sway, up * velocity[:, 1], rcond=None)[0][:2]
+    sway_columns = np.column_stack([port, velocity[:, 0], rate, rate * velocity[:, 0]])
+    current = np.linalg.lstsq(sway_columns, up * velocity[:, 1], rcond=None)[0][:2]
     # nuisance: speed lost in turns, lever arm
-    columns = np.column_stack([ahead @ current, np.abs(rate), rate])
-    x, y = columns[after] - columns[before], velocity[after, 0] - velocity[before, 0]
-    weight = np.ones(len(y))
+    columns = np.column_stack([heading @ current, np.abs(rate), rate])
+    change_columns, speed_change = columns[after] - columns[before], velocity[after, 0] - velocity[before, 0]
+    weight = np.ones(len(speed_change))
     for _ in range(PASSES):
-        covariance = np.linalg.pinv((x * weight[:, None]).T @ x)
-        left_over = y - x @ (slopes := covariance @ (x.T @ (weight * y)))
-        weight = 1.0 / (1.0 + (left_over / max(CAUCHY * float(robust_std(left_over)), 1e-9)) ** 2)
-    turn = np.cumsum(np.diff(times[before], prepend=times[before[0]]) > 2.0 * OVER_S)
-    number = int(turn[-1]) + 1
-    scores = np.bincount(turn, weight * left_over * (x @ covariance[0]), number)
-    std = math.sqrt(float((scores**2).sum()) * number / max(number - 1, 1))
-    return SwaySign(float(slopes[0]), std, number)
+        covariance = np.linalg.pinv((change_columns * weight[:, None]).T @ change_columns)
+        residual = speed_change - change_columns @ (slopes := covariance @ (change_columns.T @ (weight * speed_change)))
+        weight = 1.0 / (1.0 + (residual / max(CAUCHY * float(robust_std(residual)), 1e-9)) ** 2)
+    turn_number = np.cumsum(np.diff(times[before], prepend=times[before[0]]) > 2.0 * OVER_S)
+    n_turns = int(turn_number[-1]) + 1
+    scores = np.bincount(turn_number, weight * residual * (change_columns @ covariance[0]), n_turns)
+    std = math.sqrt(float((scores**2).sum()) * n_turns / max(n_turns - 1, 1))
+    return SwaySign(float(slopes[0]), std, n_turns)
 
 
 def sign_findings(
@@ -105,49 +105,49 @@ def sign_findings(
 
     axes_are_given: the user has set dvl_axes, which confirms all signs.
     """
-    seen = [(one.looks[topics.dvl], one.looks.get(topics.imu)) for one in recordings if topics.dvl in one.looks]
-    if not seen:
+    looks = [(each.looks[topics.dvl], each.looks.get(topics.imu)) for each in recordings if topics.dvl in each.looks]
+    if not looks:
         return
-    first = seen[0][0]
+    first = looks[0][0]
     is_turned = turns_dvl(VELOCITY_TYPES[first.msgtype], first.frame_id, parameters)
-    turn = FLU_FROM_FRD if is_turned else np.eye(3)
-    body_from_message = parameters.rotation_dvl_from_body.T @ turn
+    flu_from_dvl = FLU_FROM_FRD if is_turned else np.eye(3)
+    body_from_message = parameters.rotation_dvl_from_body.T @ flu_from_dvl
     frame = ImuFrame(rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, "")
-    each, directions = [], Directions()
-    for dvl, imu in seen:
+    sway_signs, directions = [], Directions()
+    for dvl, imu in looks:
         imu = in_time_of(dvl, imu, parameters)
         if imu is not None and imu.has_orientation:
             velocity, read = dvl.values @ body_from_message.T, frame.read(imu_columns_of(imu))
-            each.append(sway_sign(dvl.stamps_s, velocity, read))
+            sway_signs.append(sway_sign(dvl.stamps_s, velocity, read))
             rotation, known = attitude_at(read, dvl.stamps_s, GAP_S)
             directions.add(velocity[known], rotation[known])
     if directions.turn_with_heading:
         yield finding("DVL_TURNS_WITH_HEADING")
         return
-    mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in seen]).mean(axis=0)
-    given = body_from_message @ mean
-    ahead_only = np.array([given[0], 0.0, 0.0])
-    if math.hypot(given[1], given[2]) >= math.tan(LIKELY) * abs(given[0]):
+    mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in looks]).mean(axis=0)
+    mean_velocity = body_from_message @ mean
+    ahead = np.array([mean_velocity[0], 0.0, 0.0])
+    if math.hypot(mean_velocity[1], mean_velocity[2]) >= math.tan(LIKELY) * abs(mean_velocity[0]):
         return  # no vehicle that travels ahead
-    signs = [one for one in each if one is not None and one.sign]
+    signs = [each for each in sway_signs if each is not None and each.sign]
     axes, other = (FRD, FLU) if is_turned != parameters.is_z_down else (FLU, FRD)
-    if signs and all(one.sign < 0 for one in signs):
+    if signs and all(each.sign < 0 for each in signs):
         yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=other)
         return
     if axes_are_given:
         return
-    fitted, flips = least_turn(given, ahead_only) @ body_from_message, 1.0 - 2.0 * np.eye(3)
+    fitted, flips = least_turn(mean_velocity, ahead) @ body_from_message, 1.0 - 2.0 * np.eye(3)
     for row in (2,) if signs else (1, 2):
         # the axis most along this row of the body; negated, the mirrored mounting fits as well
-        along = np.abs(body_from_message[row]).round(6)
-        axis = max(range(3), key=lambda each: (along[each], each == row))
+        shares = np.abs(body_from_message[row]).round(6)
+        axis = max(range(3), key=lambda sway_signs: (shares[sway_signs], sway_signs == row))
         mirrored = flips[row][:, None] * fitted * flips[axis]
-        change, also = angle_between(fitted, mirrored), ""
+        change, addition = angle_between(fitted, mirrored), ""
         if change < SAME_ANSWER:
             continue
         effect = f"the {('yaw', 'pitch')[row - 1]} changes by {math.degrees(change):.1f}°"
         if angle_between(mirrored, body_from_message) > LIKELY:
-            mounting = as_option(nominal_rpy(mirrored @ turn))
-            effect, also = f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}"
+            mounting = as_option(nominal_rpy(mirrored @ flu_from_dvl))
+            effect, addition = f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}"
         way = WAYS[row][bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down]
-        yield finding("DVL_SIGN_OPEN", axis="xyz"[axis], effect=effect, way=way, axes=axes, also=also)
+        yield finding("DVL_SIGN_OPEN", axis="xyz"[axis], effect=effect, way=way, axes=axes, also=addition)

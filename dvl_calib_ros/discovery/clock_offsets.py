@@ -65,22 +65,23 @@ class FoundClocks:
 
     def says(self) -> Iterator[str]:
         """Yield one sentence per clock with an offset: its delay, and the treatment."""
-        r = self.registration
-        if r.unsteady is not None and not self.doubt:
-            taken = ", ".join(f"{name} {self.offsets[name]:.13g}" for name in sorted(MOVING & self.offsets.keys()))
-            yield f"{r.unsteady.reason(0.0).says}: subtracted ({taken})"
-        for name, late in r.offsets.items():
+        registration, apart = self.registration, self.registration.apart
+        if registration.unsteady is not None and not self.doubt:
+            values = ", ".join(f"{name} {self.offsets[name]:.13g}" for name in sorted(MOVING & self.offsets.keys()))
+            yield f"{registration.unsteady.reason(0.0).says}: subtracted ({values})"
+        for name, delay_s in registration.offsets.items():
             if name in self.offsets:
-                done = f"subtracted ({name} {late:.2f})"
-            elif name == "dvl_time_offset" and abs(late) < SMALL_DELAY_S:
-                done = "left to the calibration, which estimates it"
+                treatment = f"subtracted ({name} {delay_s:.2f})"
+            elif name == "dvl_time_offset" and abs(delay_s) < SMALL_DELAY_S:
+                treatment = "left to the calibration, which estimates it"
             else:
-                done = "not subtracted"
-            which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
-            yield f"{r.clock_reason(name).says}{which}: {done}"
-        if r.apart.is_shown and not (r.offsets or self.doubt):
+                treatment = "not subtracted"
+            is_ambiguous = name == "reference_time_offset" and not registration.is_turned
+            alternative = ", or the DVL's as much early" if is_ambiguous else ""
+            yield f"{registration.clock_reason(name).says}{alternative}: {treatment}"
+        if apart.is_shown and not (registration.offsets or self.doubt):
             yield (
-                f"stamps of DVL and reference differ by {abs(r.apart.delay_s):.2f} ± {r.apart.std:.2f} s; it is "
+                f"stamps of DVL and reference differ by {abs(apart.delay_s):.2f} ± {apart.std:.2f} s; it is "
                 f"unknown whose clock is wrong: drive turns at two speeds"
             )
 
@@ -94,16 +95,16 @@ def find_clocks(
     """
     if topics.gnss not in recording.columns or topics.dvl not in recording.columns:
         return None
-    each = [_find_in_recording(one, topics, parameters, knows_mounting, given) for one in recording.each]
-    first = each[0]
-    if len(each) > 1 and any(one is not None and one.offsets.keys() & MOVING for one in each):
+    found = [_find_in_recording(other, topics, parameters, knows_mounting, given) for other in recording.each]
+    first = found[0]
+    if len(found) > 1 and any(other is not None and other.offsets.keys() & MOVING for other in found):
         return None  # drift or step differ between recordings
-    if first is None or any(one is None for one in each):
+    if first is None or any(other is None for other in found):
         return None
-    for one in each[1:]:
-        assert one is not None
-        names = {*first.offsets, *one.offsets}
-        if any(abs(first.offsets.get(name, 0.0) - one.offsets.get(name, 0.0)) > REPORTED_FROM_S for name in names):
+    for other in found[1:]:
+        assert other is not None
+        names = {*first.offsets, *other.offsets}
+        if any(abs(first.offsets.get(name, 0.0) - other.offsets.get(name, 0.0)) > REPORTED_FROM_S for name in names):
             return None
     return first
 
@@ -121,8 +122,8 @@ def _find_in_recording(
         rotation = hypothesis.rotation_dvl_from_body
         is_first = hypothesis is parameters
         if is_first and (far := far_clocks(motion, rotation)) is not None:
-            nothing = register(motion, rotation.T, np.array(hypothesis.lever_arm))
-            return None if nothing is None else FoundClocks(nothing, {}, parameters, far)
+            as_configured = register(motion, rotation.T, np.array(hypothesis.lever_arm))
+            return None if as_configured is None else FoundClocks(as_configured, {}, parameters, far)
         mounting = rotation.T if knows_mounting or is_first else None
         found = register(motion, mounting, np.array(hypothesis.lever_arm))
         if found is not None and (best is None or found.residual < CLEARLY * best[0].residual):
@@ -177,17 +178,17 @@ def _one_per_interval(block: SampleBlock) -> SampleBlock:
 
 def on_imu_clock(recording: Recording, topics: Topics, found: Registration) -> Survey:
     """Return the previewed streams with their stamps corrected to the IMU's clock by a registration."""
-    seen = recording.whole(topics)
+    survey = recording.whole(topics)
     delays_s = {topics.dvl: found.dvl.delay_s, topics.gnss: found.reference.delay_s}
     if not found.is_turned:  # without turns only the delay between DVL and reference is observable
         delays_s = {topics.dvl: found.apart.delay_s}
     looks = {
         name: replace(look, stamps_s=look.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
-        for name, look in seen.looks.items()
+        for name, look in survey.looks.items()
     }
     if topics.dvl in looks:
         looks[topics.dvl] = _thinned(looks[topics.dvl])
-    return replace(seen, looks=looks)
+    return replace(survey, looks=looks)
 
 
 def _thinned(look: Look) -> Look:

@@ -73,31 +73,32 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
     if found.topics.gnss not in recording.types and not found.contradictions:
-        seen_whole = [one.whole(found.topics) for one in recording.each]
-        signs = sign_findings(seen_whole, found.topics, found.parameters, "dvl_axes" in named.parameters)
+        surveys = [one.whole(found.topics) for one in recording.each]
+        signs = sign_findings(surveys, found.topics, found.parameters, "dvl_axes" in named.parameters)
         return replace(found, contradictions=tuple(signs))
     clocks = clocks_of_recording(recording, found, named)
     if clocks is None:
         return found
     if clocks.registration.offsets:
         # finding frames needs velocities of the same time
-        seen = on_imu_clock(recording, found.topics, clocks.registration)
-        seen = replace(seen, topics=recording.survey.topics, counts=recording.survey.counts)
+        survey = on_imu_clock(recording, found.topics, clocks.registration)
+        survey = replace(survey, topics=recording.survey.topics, counts=recording.survey.counts)
         topics = found.topics
-        imu = topics.imu if topics.imu in seen.topics else named.imu_topic
+        imu = topics.imu if topics.imu in survey.topics else named.imu_topic
         all_named = replace(named, dvl_topic=topics.dvl, gnss_topic=topics.gnss, imu_topic=imu)
-        again = _Search(seen, parameters, all_named, recording.where).run()
-        if again.values != found.values:
-            found, clocks = again, clocks_of_recording(recording, again, named) or clocks
+        second = _Search(survey, parameters, all_named, recording.where).run()
+        if second.values != found.values:
+            found, clocks = second, clocks_of_recording(recording, second, named) or clocks
         else:
-            found = again
+            found = second
+    clocks_given = {name: getattr(parameters, name) for name in clocks.offsets}
     return replace(
         found,
-        parameters=found.parameters.replace(**{n: getattr(parameters, n) + s for n, s in clocks.offsets.items()}),
+        parameters=found.parameters.replace(**{name: clocks_given[name] + s for name, s in clocks.offsets.items()}),
         found=(*found.found, *clocks.says()),
         contradictions=(*found.contradictions, *([clocks.doubt] if clocks.doubt else [])),
         clocks=clocks,
-        clocks_given={n: getattr(parameters, n) for n in clocks.offsets},
+        clocks_given=clocks_given,
     )
 
 
@@ -105,7 +106,7 @@ class _Search:
     """One search; the findings are collected in attributes."""
 
     def __init__(self, seen: Survey, parameters: Parameters, given: Given, where: str) -> None:
-        self._seen, self._parameters, self._given, self._where = seen, parameters, given, where
+        self._survey, self._parameters, self._given, self._where = seen, parameters, given, where
         used = parameters.use_transforms
         self._tree = FrameTree.of(seen.transforms if used else (), seen.descriptions if used else ())
         self._values: dict[str, Any] = {}
@@ -118,12 +119,12 @@ class _Search:
 
     def run(self) -> Discovery:
         """Choose topics, then the frames of the DVL, if it has data."""
-        topics = self._topics()
-        looks = self._seen.looks
+        topics = self._choose_topics()
+        looks = self._survey.looks
         dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
         if dvl is not None:
-            self._frames(dvl, *(in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
-        self._found.insert(0, self._topics_said(topics))
+            self._choose_frames(dvl, *(in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
+        self._found.insert(0, self._describe_topics(topics))
         return Discovery(
             topics,
             self._parameters.replace(**self._values),
@@ -137,48 +138,48 @@ class _Search:
             mounting_because=self._mounting_because,
         )
 
-    def _topics(self) -> Topics:
+    def _choose_topics(self) -> Topics:
         """Choose the three topics: given ones, otherwise by type, name and motion."""
         given, default = self._given, Topics()
-        dvl = self._named("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._seen, default.dvl, self._where)
-        self._notes += topic_choice.other_dvls(self._seen, dvl, difference_of)
+        dvl = self._checked("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._survey, default.dvl, self._where)
+        self._notes += topic_choice.other_dvls(self._survey, dvl, difference_of)
         gnss, imu = default.gnss, default.imu
         if given.gnss_topic is None:
-            chosen, notes = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
+            chosen, notes = topic_choice.choose_reference(self._survey, default.gnss, dvl, difference_of)
             gnss = chosen or default.gnss
             self._notes += notes
         elif given.gnss_topic != NONE:
-            gnss = self._named("gnss", given.gnss_topic) or gnss
+            gnss = self._checked("gnss", given.gnss_topic) or gnss
         else:
             gnss = NONE
         if given.imu_topic is None:
-            imu = topic_choice.choose_imu(self._seen, default.imu, gnss) or default.imu
+            imu = topic_choice.choose_imu(self._survey, default.imu, gnss) or default.imu
         else:
-            imu = NONE if given.imu_topic == NONE else self._named("imu", given.imu_topic) or imu
-        if imu.endswith(ORIENTATION) and imu in self._seen.topics:
+            imu = NONE if given.imu_topic == NONE else self._checked("imu", given.imu_topic) or imu
+        if imu.endswith(ORIENTATION) and imu in self._survey.topics:
             self._found.append(
                 f"no IMU gives an attitude; it is the orientation of {imu.removesuffix(ORIENTATION)}, and turn rates "
                 "are its derivative"
             )
         return Topics(dvl, gnss, imu)
 
-    def _named(self, role: str, name: str | None) -> str | None:
+    def _checked(self, role: str, name: str | None) -> str | None:
         """Return a named topic if the recording has it with a usable type. Raises InputError."""
         if name is None:
             return None
         return topic_choice.checked_topic(
-            f"--{role}-topic", name, topic_choice.wanted_types(role), self._seen, self._where
+            f"--{role}-topic", name, topic_choice.wanted_types(role), self._survey, self._where
         )
 
-    def _topics_said(self, topics: Topics) -> str:
+    def _describe_topics(self, topics: Topics) -> str:
         """Describe the chosen topics with type, frame and rate, for the first line of the output."""
         parts = []
         for role, name in (("DVL", topics.dvl), ("reference", topics.gnss), ("IMU", topics.imu)):
-            kind = self._seen.topics.get(name)
+            kind = self._survey.topics.get(name)
             if kind is None:
                 parts.append(f"no {role}")
                 continue
-            look = self._seen.looks.get(name)
+            look = self._survey.looks.get(name)
             rate = f", {look.rate_hz:.3g} Hz" if look is not None and look.rate_hz else ""
             frame = ""
             if role == "reference" and look is not None:
@@ -192,12 +193,12 @@ class _Search:
     def _is_given(self, name: str) -> bool:
         return name in self._given.parameters
 
-    def _frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
+    def _choose_frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
         """Choose mounting, axes and frames from transforms, motion and gravity; note what was found."""
         placed = self._place_dvl(dvl)
-        known = self._parameters.rotation_dvl_from_body.T if self._is_given("mounting_rpy") else None
-        if known is None and placed is not None:
-            known = placed.rotation
+        mounting = self._parameters.rotation_dvl_from_body.T if self._is_given("mounting_rpy") else None
+        if mounting is None and placed is not None:
+            mounting = placed.rotation
         imu_placed = None if imu is None else self._tree.placed(imu.frame_id, self._parameters.base_frame)
         if placed is None and imu_placed is not None:
             self._use_base(imu_placed.base)
@@ -210,30 +211,30 @@ class _Search:
                 f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which is no information and not used "
                 "(-p use_message_covariance:=false)"
             )
-        self._admit_slow(dvl)
+        self._lower_min_speed(dvl)
         if reference is not None:
-            chosen = self._fit(frames, dvl, reference, imu, known, placed)
-        taken = frames.imu if chosen is None else chosen.imu
-        self._use_base_axes(taken is not None and taken.z_down)
+            chosen = self._fit(frames, dvl, reference, imu, mounting, placed)
+        imu_choice = frames.imu if chosen is None else chosen.imu
+        self._use_base_axes(imu_choice is not None and imu_choice.z_down)
         is_turned = frames.dvl_is_turned(self._is_z_down)
         if chosen is not None and reference is not None:
             agreement = self._chosen = chosen.agreement
             is_turned = agreement.reading.turned
             self._contradictions += chosen.says
-            self._use_reading(agreement, known, reference, imu)
-            self._measure_noise(agreement, known, dvl, reference)
+            self._use_reading(agreement, mounting, reference, imu)
+            self._measure_noise(agreement, mounting, dvl, reference)
         elif reference is None:
-            self._mounting_from_motion(dvl, is_turned, known)
-        if taken is not None:
-            self._use_imu(taken.frame)
+            self._mounting_from_motion(dvl, is_turned, mounting)
+        if imu_choice is not None:
+            self._use_imu(imu_choice.frame)
         parameters = self._parameters.replace(base_axes=FRD if self._is_z_down else FLU)
         if parameters.dvl_axes == FROM_MESSAGE and is_turned != turns_dvl(
             VELOCITY_TYPES[dvl.msgtype], dvl.frame_id, parameters
         ):
             axes = self._values["dvl_axes"] = FRD if is_turned != self._is_z_down else FLU
             self._found.append(f"the DVL's data are used as {AXES[axes]} (dvl_axes {axes})")
-        if known is not None and not self._is_given("mounting_rpy"):
-            self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
+        if mounting is not None and not self._is_given("mounting_rpy"):
+            self._values["mounting_rpy"] = tuple(rpy_from_rotation(mounting).tolist())
         if placed is not None and placed.source:
             self._place_lever_arm(placed, reference)
         if reference is not None and not (_is_located(placed) or self._is_given("lever_arm")):
@@ -246,7 +247,7 @@ class _Search:
             self._use_claimed_heading(imu)
             self._check_gravity(imu)
 
-    def _admit_slow(self, dvl: Look) -> None:
+    def _lower_min_speed(self, dvl: Look) -> None:
         """Set min_speed of a vehicle that mostly moves more slowly than the default."""
         speed = np.linalg.norm(dvl.values, axis=1)
         moving = speed[speed > SLOWEST_MPS]
@@ -275,10 +276,10 @@ class _Search:
 
     def _check_gravity(self, imu: Look) -> None:
         """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
-        gravity, taken = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
+        gravity, parameters = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
         if gravity is not None and (
             found := gravity.contradiction(
-                imu.topic, rotation_from_rpy(taken.imu_rpy), taken.imu_frame, taken.is_z_down
+                imu.topic, rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, parameters.is_z_down
             )
         ):
             self._contradictions.append(found)
@@ -299,13 +300,13 @@ class _Search:
         if self._is_given("dvl_position"):
             return
         is_known = _is_located(placed) and not self._is_given("lever_arm")
-        at = None if reference is None else self._known_reference_position(reference)
+        reference_position = None if reference is None else self._known_reference_position(reference)
         if self._is_given("reference_position"):
-            at = np.array(self._parameters.reference_position)
-        if at is not None and reference is not None:
+            reference_position = np.array(self._parameters.reference_position)
+        if reference_position is not None and reference is not None:
             self._values["dvl_position"] = FROM_REFERENCE
-            if at.any() and not self._is_given("reference_position"):
-                self._values["reference_position"] = tuple((at + 0.0).tolist())
+            if reference_position.any() and not self._is_given("reference_position"):
+                self._values["reference_position"] = tuple((reference_position + 0.0).tolist())
         elif is_known:
             self._values["dvl_position"] = TOLD
 
@@ -329,8 +330,8 @@ class _Search:
             self._contradictions.append(finding("DVL_FRAME_NOT_OWN", topic=dvl.topic, frame=dvl.frame_id))
         placed = self._tree.placed(frame, base_frame)
         if placed is None and not self._is_body_or_earth(frame):
-            like = self._tree.likely(topic_choice.DVL_WORDS)
-            placed = None if like is None else self._tree.placed(like, base_frame)
+            likely_frame = self._tree.likely(topic_choice.DVL_WORDS)
+            placed = None if likely_frame is None else self._tree.placed(likely_frame, base_frame)
             if placed is not None:
                 self._notes.append(finding("FRAME_NOT_IN_TREE", frame=frame, other=placed.frame))
         if placed is not None:
@@ -353,8 +354,8 @@ class _Search:
         """Return the assumed frame of the reference; None without one, or if unknown."""
         if reference is None:
             return None
-        taken = self._values.get("gnss_frame")
-        declared = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
+        chosen_name = self._values.get("gnss_frame")
+        declared = self._declared_reference(reference) if chosen_name is None else DECLARED_FRAMES[chosen_name]
         return None if declared is None else declared.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
@@ -391,12 +392,12 @@ class _Search:
         declared = self._declared_reference(reference)
         if declared is not None:
             declared = declared.in_base(FRD if self._is_z_down else FLU)
-        taken = DECLARED_FRAMES[reading.reference]
+        chosen_frame = DECLARED_FRAMES[reading.reference]
         # without an attitude only the body frame could be tried
         if imu is None and declared is None and chosen.best_residual >= MAX_RESIDUAL:
             self._notes.append(finding("REFERENCE_FRAME_NOT_TOLD", topic=reference.topic))
-        elif taken != declared:
-            name = self._values["gnss_frame"] = taken.name
+        elif chosen_frame != declared:
+            name = self._values["gnss_frame"] = chosen_frame.name
             if declared is None:
                 self._found.append(
                     f"the reference is used as {name}, which fits best; its frame {reference.frame_id!r} does not "
@@ -411,13 +412,13 @@ class _Search:
             residual = self._readings.registered(reading, np.eye(3)).residual
             turned_residual, rotation, *_ = self._readings.registered(reading, None)
             if self._readings.without_noise(turned_residual) < BETTER_BY * self._readings.without_noise(residual):
-                agree = "where DVL and reference agree best"
+                why = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
                 # a roll that is hardly observable on a level vehicle is set to zero, unless the data need it
                 level = (0.0, *rpy[1:])
-                level_left, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
-                self._mounting_found(level if BETTER * level_left <= turned_residual else rpy, agree)
+                level_residual, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
+                self._mounting_found(level if BETTER * level_residual <= turned_residual else rpy, why)
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
         """Set the noise of a reference that claims none, far too little, or more than its velocities show."""
@@ -442,18 +443,18 @@ class _Search:
         ):
             return
         best, *_ = self._readings.registered(chosen.reading, None if known is None else known.T)
-        shown = max(max(min(best, chosen.best_residual), least) * per_axis, QUIETEST)
-        too_much = may_claim_less and most > shown
+        noise = max(max(min(best, chosen.best_residual), least) * per_axis, QUIETEST)
+        too_much = may_claim_less and most > noise
         if not (too_much or too_little or claims_none or says_nothing):
             return
         if too_much or too_little:
             self._values["use_message_covariance"] = False
-        self._values["gnss_aided_std"] = float(f"{shown:.2g}")
+        self._values["gnss_aided_std"] = float(f"{noise:.2g}")
         whose = "DVL and reference claim" if too_much and not is_position else "the reference claims"
         size = "no noise" if claims_none or not claimed else f"{claimed if too_much else reference.claimed_std:.2g} m/s"
         self._found.append(
-            f"{whose} {size}; against the DVL it shows {shown:.2g} m/s per axis, which is used "
-            f"(-p gnss_aided_std:={shown:.2g})"
+            f"{whose} {size}; against the DVL it shows {noise:.2g} m/s per axis, which is used "
+            f"(-p gnss_aided_std:={noise:.2g})"
         )
 
     def _use_imu(self, frame: ImuFrame) -> None:
@@ -521,10 +522,10 @@ class _Search:
 
 def _other_axes(rotation_body_from_dvl: Array, mean: Array) -> str:
     """Return the part of a remedy for axes with which a mounting (3, 3) makes a mean velocity (3,) point ahead."""
-    least = math.cos(OTHER_MOUNTING) * float(np.linalg.norm(mean))
+    min_ahead = math.cos(OTHER_MOUNTING) * float(np.linalg.norm(mean))
     changes = {f"negate {axis}": mean * sign for axis, sign in zip("xyz", 1.0 - 2.0 * np.eye(3), strict=True)}
     changes["swap x and y"] = mean[[1, 0, 2]]
-    fitting = [change for change, seen in changes.items() if rotation_body_from_dvl[0] @ seen > least]
+    fitting = [change for change, changed in changes.items() if rotation_body_from_dvl[0] @ changed > min_ahead]
     return f", or, if that mounting is right, {' or '.join(fitting)} in the DVL's driver" if fitting else ""
 
 

@@ -33,8 +33,8 @@ from ..calibration.registration.frame_hypotheses import (
     Reading,
     Readings,
     Registered,
+    are_rates_frd,
     nominal_rpy,
-    turns_right,
 )
 from ..calibration.streams.imu_frame import ENU_FROM
 from ..calibration.streams.screening import unit_quaternions
@@ -174,28 +174,28 @@ class FrameChooser:
             rotation = rotation_from_rpy(self._parameters.imu_rpy)
             frame = ImuFrame(rotation, self._parameters.imu_frame, "as given", self._parameters.heading_offset)
             return [ImuHypothesis(frame, self._parameters.is_z_down, 0.0)]
-        at = np.eye(3) if placed is None else placed.rotation
-        text = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
+        body_from_imu = np.eye(3) if placed is None else placed.rotation
+        placement = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
         frames = [
-            (ImuFrame(at, IMU_ENU, text), 0.0),
+            (ImuFrame(body_from_imu, IMU_ENU, placement), 0.0),
             (
-                ImuFrame(at @ FLU_FROM_FRD, IMU_NED, f"forward-right-down in NED, {text}"),
+                ImuFrame(body_from_imu @ FLU_FROM_FRD, IMU_NED, f"forward-right-down in NED, {placement}"),
                 UNPLACED_IN_NED if placed is None else IMU_IN_NED,
             ),
-            (ImuFrame(at, IMU_NED, f"in NED, {text}"), IMU_IN_OTHER_WORLD),
-            (ImuFrame(at, NWU, f"with a heading that counts from north, {text}"), IMU_OTHERWISE),
+            (ImuFrame(body_from_imu, IMU_NED, f"in NED, {placement}"), IMU_IN_OTHER_WORLD),
+            (ImuFrame(body_from_imu, NWU, f"with a heading that counts from north, {placement}"), IMU_OTHERWISE),
         ]
-        if not np.allclose(at, np.eye(3)):
+        if not np.allclose(body_from_imu, np.eye(3)):
             note = "as the body, despite its transform"
             frames.append((ImuFrame(np.eye(3), IMU_ENU, note), IMU_IN_OTHER_WORLD))
         if self._gravity is not None:
-            frames.append((ImuFrame(at @ FLU_FROM_FRD, IMU_ENU, f"turned over, {text}"), IMU_OTHERWISE))
-        found = []
+            frames.append((ImuFrame(body_from_imu @ FLU_FROM_FRD, IMU_ENU, f"turned over, {placement}"), IMU_OTHERWISE))
+        hypotheses = []
         for frame, prior in frames:
             z_down = self._body_is_z_down(frame)
             if "base_axes" in self._given and z_down != self._parameters.is_z_down:
                 continue
-            if z_down and frame.world == IMU_NED and frame.rotation_body_from_imu is at:
+            if z_down and frame.world == IMU_NED and frame.rotation_body_from_imu is body_from_imu:
                 prior = 0.0  # world of a vehicle that is z down
             elif z_down:
                 prior += IMU_IN_OTHER_WORLD
@@ -205,8 +205,9 @@ class FrameChooser:
             if self._gravity is not None:
                 wrong = self._gravity.contradicts(frame.rotation_body_from_imu, frame.world, z_down)
                 prior += (0.0, GRAVITY_CONTRADICTS, GRAVITY_INVERTED)[wrong]
-            found.append(ImuHypothesis(replace(frame, heading_offset=self._parameters.heading_offset), z_down, prior))
-        return found
+            frame = replace(frame, heading_offset=self._parameters.heading_offset)
+            hypotheses.append(ImuHypothesis(frame, z_down, prior))
+        return hypotheses
 
     def _body_is_z_down(self, frame: ImuFrame) -> bool:
         """Return whether the body's z points down under a hypothesis of the IMU, by its attitude."""
@@ -220,9 +221,9 @@ class FrameChooser:
 
     def dvl_is_turned(self, z_down: bool) -> bool:
         """Return whether frame, transform and type declare DVL axes that must be converted to those of base_frame."""
-        p, frame_id = self._parameters, self._dvl.frame_id.lower()
-        if p.dvl_axes != FROM_MESSAGE:
-            return (p.dvl_axes == FRD) != z_down
+        parameters, frame_id = self._parameters, self._dvl.frame_id.lower()
+        if parameters.dvl_axes != FROM_MESSAGE:
+            return (parameters.dvl_axes == FRD) != z_down
         if frame_id.endswith(("_frd", "_flu")):
             return frame_id.endswith("_frd") != z_down
         # a transform with z down describes the driver's own axes instead of REP-103's
@@ -237,35 +238,35 @@ class FrameChooser:
     def _reference_priors(self, reference: Look, imu: ImuHypothesis | None) -> dict[str, float]:
         """Return the log odds of the frames that a reference may be in, by name."""
         z_down = self._says_z_down if imu is None else imu.z_down
-        own, turned = (FRD, FLU) if z_down else (FLU, FRD)
+        own_axes, other_axes = (FRD, FLU) if z_down else (FLU, FRD)
         declared = declared_reference(reference, self._parameters, self._base_frame)
         if declared is not None:
-            declared = declared.in_base(own)
+            declared = declared.in_base(own_axes)
             if self._parameters.gnss_frame != FROM_FRAME_ID:
                 return {declared.name: 0.0}
-        names = ["enu", "body", turned, "ned", NWU]
+        names = ["enu", "body", other_axes, "ned", NWU]
         if declared is None:
             priors = {name: UNDECLARED.get(name, OTHER_WORLD) for name in names}
         else:
-            of_body = declared.frame is VelocityFrame.BODY
-            of_turned = TWIST_IN_ROS_AXES if z_down else REFERENCE_AXES_OTHER
-            other = {"body": REFERENCE_AXES_OTHER, turned: of_turned} if of_body else {}
+            is_in_body = declared.frame is VelocityFrame.BODY
+            other_axes_prior = TWIST_IN_ROS_AXES if z_down else REFERENCE_AXES_OTHER
+            other = {"body": REFERENCE_AXES_OTHER, other_axes: other_axes_prior} if is_in_body else {}
             priors = {name: other.get(name, REFERENCE_FRAME_OTHER) for name in names} | {declared.name: 0.0}
-        shown = twist_axes(reference)
-        if shown is not None:
-            agreeing = "body" if shown == own else shown
+        observed = twist_axes(reference)
+        if observed is not None:
+            agreeing = "body" if observed == own_axes else observed
             return {name: prior + TWIST_POSE_OTHER for name, prior in priors.items()} | {agreeing: 0.0}
         if not z_down and (declared is None or declared.frame is not VelocityFrame.BODY):
-            right = self._points_down(reference, imu)
-            priors["body" if right else FRD] += TWIST_RATES_OTHER
+            is_frd = self._points_down(reference, imu)
+            priors["body" if is_frd else FRD] += TWIST_RATES_OTHER
         return priors
 
     def _points_down(self, reference: Look, imu: ImuHypothesis | None) -> bool:
         """Return whether a twist is forward-right-down, by its turn rates or else by its pose's world."""
         if self._imu is not None and imu is not None and reference.rates is not None:
-            turns = turns_right(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
-            if turns is not None:
-                return turns
+            is_frd = are_rates_frd(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
+            if is_frd is not None:
+                return is_frd
         world = frame_named(reference.world, ())  # of the pose: by custom a body in NED is forward-right-down
         return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
 
@@ -295,31 +296,31 @@ class FrameChooser:
         in_earth = declared_frame is not None and declared_frame.frame is not VelocityFrame.BODY
         if not found or (in_earth and all(each.reading.in_body for each in found)):
             return None  # without an attitude the declaration cannot be tested and is kept
-        tried = [_Tried(each, mounting, priors[each.reading]) for each in found]
+        candidates = [_Tried(each, mounting, priors[each.reading]) for each in found]
         if mounting is not None:  # or the mounting is wrong, and the DVL's axes are as declared
             free = readings.agreements([each for each in priors if each.turned == as_declared[each]], None)
-            tried += [
+            candidates += [
                 _Tried(each, None, priors[each.reading] + MOUNTING_OTHER)
                 for each in free
                 if angle_between(each.rotation_dvl_from_body, mounting) > TURNED_FROM
             ]
-        first = {
+        first_odds = {
             each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.residual)
-            for each in tried
+            for each in candidates
         }
-        ranked = sorted(tried, key=lambda each: -first[each])
+        ranked = sorted(candidates, key=lambda each: -first_odds[each])
         reasons: tuple[Reason, ...] = ()
         if in_earth:
             first_best = ranked[0].agreement
             if first_best.reading.in_body and not readings.is_in_body(first_best):
                 reasons = (finding("BODY_OR_EARTH"),)
                 ranked = [each for each in ranked if not each.reading.in_body] or ranked
-        likely = [each for each in ranked if first[each] > first[ranked[0]] - FAR_WORSE][:MOST_REGISTERED]
-        expected = max(ranked, key=lambda each: each.prior)
-        if expected not in likely:
-            likely.append(expected)
-        if likely == [expected] and expected.mounting is mounting:
-            return FrameChoice(expected.agreement, imus[expected.reading], reasons)
+        likely = [each for each in ranked if first_odds[each] > first_odds[ranked[0]] - FAR_WORSE][:MOST_REGISTERED]
+        most_expected = max(ranked, key=lambda each: each.prior)
+        if most_expected not in likely:
+            likely.append(most_expected)
+        if likely == [most_expected] and most_expected.mounting is mounting:
+            return FrameChoice(most_expected.agreement, imus[most_expected.reading], reasons)
         fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
         odds = {
             each: each.odds(fit.rotation_dvl_from_body)
@@ -328,30 +329,30 @@ class FrameChooser:
             for each, fit in fits.items()
         }
         if math.inf in (fit.residual for fit in fits.values()):  # a failed registration is no evidence
-            odds = first
-            turns = {each: each.agreement.rotation_dvl_from_body for each in fits}
-            fits = {each: fit._replace(rotation_dvl_from_body=turns[each]) for each, fit in fits.items()}
+            odds = first_odds
+            rotations = {each: each.agreement.rotation_dvl_from_body for each in fits}
+            fits = {each: fit._replace(rotation_dvl_from_body=rotations[each]) for each, fit in fits.items()}
         best, *others = sorted(likely, key=lambda each: -odds[each])
-        alike = [each for each in others if odds[each] > odds[best] - AS_LIKELY]
-        for rival in alike:
-            one, other = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
-            other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
+        equally_likely = [each for each in others if odds[each] > odds[best] - AS_LIKELY]
+        for rival in equally_likely:
+            best_options, rival_options = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
+            other_axes = any(best_options[name] != rival_options[name] for name in ("dvl_axes", "base_axes"))
             # in which the IMU's frame affects only the lever arm
             in_body = best.reading.in_body and rival.reading.in_body
             fitted = [fits[each].rotation_dvl_from_body for each in (best, rival)]
             if other_axes or (not in_body and angle_between(*fitted) > SAME_ANSWER):
-                reasons += (_ambiguous(one, other, fitted),)
+                reasons += (_ambiguous(best_options, rival_options, fitted),)
                 break
-        turn = fits[best].rotation_dvl_from_body
+        best_rotation = fits[best].rotation_dvl_from_body
         if (
             mounting is not None
             and best.mounting is None
-            and not readings.are_axes_mirrored(best.reading, turn, mounting)
+            and not readings.are_axes_mirrored(best.reading, best_rotation, mounting)
         ):
             imu = None if best.reading.in_body else imus[best.reading]
             mean = self._dvl.values[np.isfinite(self._dvl.values).all(axis=1)].mean(axis=0)
             travel = FLU_FROM_FRD @ mean if best.reading.turned else mean
-            reasons += (_mounting_contradicted(mounting.T, turn.T, imu, travel),)
+            reasons += (_mounting_contradicted(mounting.T, best_rotation.T, imu, travel),)
         return FrameChoice(best.agreement, imus[best.reading], reasons)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
@@ -374,20 +375,20 @@ def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Arr
     if not differing:
         differing = ["mounting_rpy"]
         taken, other = ({"mounting_rpy": as_option(nominal_rpy(turn.T))} for turn in turns)
-    said = [" with ".join(f"{name} {these[name]}" for name in differing) for these in (taken, other)]
-    asked, value = differing[0], other[differing[0]]
-    asking = {"what": ASKED.get(asked, "the mounting"), "axes": AXES.get(value, value), "parameter": asked}
-    return finding("FRAMES_AMBIGUOUS", taken=said[0], other=said[1], first=taken[asked], value=value, **asking)
+    texts = [" with ".join(f"{name} {these[name]}" for name in differing) for these in (taken, other)]
+    parameter, value = differing[0], other[differing[0]]
+    asking = {"what": ASKED.get(parameter, "the mounting"), "axes": AXES.get(value, value), "parameter": parameter}
+    return finding("FRAMES_AMBIGUOUS", taken=texts[0], other=texts[1], first=taken[parameter], value=value, **asking)
 
 
 def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None, travel: Array) -> Reason:
-    """Return the finding of another mounting; its remedy names what looks the same.
+    """Return the finding that another mounting fits; its remedy also names a heading offset or axes that look the same.
 
     given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
     travel: (3,) m/s, mean velocity in the DVL. It is ahead with `given` if the heading is wrong, else with `found`.
     """
     rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)
-    first = also = ""
+    first = addition = ""
     about_z = fitting[2] - float(rpy[2])
     is_drawn = abs(math.remainder(about_z, DRAWN)) < NOMINAL_TOL_RAD[2]
     if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=NOMINAL_TOL_RAD[0]):
@@ -396,13 +397,13 @@ def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None
         if (given @ travel)[0] > (found @ travel)[0]:
             first = f"{declination}; if the heading is right, "
         else:
-            also = f"; if the mounting is right, {declination}"
-    shares = np.diag(given.T @ found)
-    if np.abs(shares).min() > math.cos(TURNED_FROM):  # a half turn
-        negated = " and ".join(axis for axis, share in zip("xyz", shares, strict=True) if share < 0.0)
-        also = f", or, if that mounting is right, negate {negated} in the DVL's driver"
-    said = {"given": in_degrees(rpy), "found": in_degrees(fitting), "option": as_option(fitting)}
-    return finding("MOUNTING_CONTRADICTED", **said, first=first, also=also)
+            addition = f"; if the mounting is right, {declination}"
+    same_axes = np.diag(given.T @ found)
+    if np.abs(same_axes).min() > math.cos(TURNED_FROM):  # a half turn
+        negated = " and ".join(axis for axis, share in zip("xyz", same_axes, strict=True) if share < 0.0)
+        addition = f", or, if that mounting is right, negate {negated} in the DVL's driver"
+    values = {"given": in_degrees(rpy), "found": in_degrees(fitting), "option": as_option(fitting)}
+    return finding("MOUNTING_CONTRADICTED", **values, first=first, also=addition)
 
 
 def _arm_odds(fit: Registered) -> float:
@@ -429,28 +430,29 @@ def twist_axes(look: Look) -> str | None:
     if look.pose is None or not len(look.pose):
         return None
     quaternion = unit_quaternions(look.pose[:, 3:])
-    use = np.isfinite(quaternion).all(axis=1) & np.isfinite(look.values).all(axis=1)
-    times, place, velocity = look.stamps_s[use], look.pose[use, :3], look.values[use]
+    known = np.isfinite(quaternion).all(axis=1) & np.isfinite(look.values).all(axis=1)
+    times, position, velocity = look.stamps_s[known], look.pose[known, :3], look.values[known]
     if len(times) < 2:
         return None
-    rotation = rotation_from_quaternion(quaternion[use])
+    rotation = rotation_from_quaternion(quaternion[known])
     after = np.searchsorted(times, times + POSE_STEP_S)
     before = np.flatnonzero((after < len(times)) & (times[np.minimum(after, len(times) - 1)] - times < POSE_LONGEST_S))
     after = after[before]
     if not len(before):
         return None
     seconds = (times[after] - times[before])[:, None]
-    moved = (place[after] - place[before]) / seconds
-    steps = np.diff(times, prepend=times[0])[:, None]
+    pose_velocity = (position[after] - position[before]) / seconds
+    intervals = np.diff(times, prepend=times[0])[:, None]
 
-    def residual(seen: Array) -> float:
-        way = np.cumsum(0.5 * steps * (seen + np.roll(seen, 1, axis=0)), axis=0)
-        return float(np.sqrt((((way[after] - way[before]) / seconds - moved) ** 2).sum(axis=1).mean()))
+    def residual(velocities: Array) -> float:
+        path = np.cumsum(0.5 * intervals * (velocities + np.roll(velocities, 1, axis=0)), axis=0)
+        return float(np.sqrt((((path[after] - path[before]) / seconds - pose_velocity) ** 2).sum(axis=1).mean()))
 
-    turned = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
-    tried = {name: residual(seen) for name, seen in {**turned, "enu": velocity, "ned": velocity @ ENU_FROM_NED}.items()}
-    best, second = sorted(tried, key=tried.__getitem__)[:2]
-    if tried[best] > MAX_RESIDUAL * look.speed or tried[best] > BETTER_BY * tried[second]:
+    in_body_axes = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
+    hypotheses = {**in_body_axes, "enu": velocity, "ned": velocity @ ENU_FROM_NED}
+    residuals = {name: residual(velocities) for name, velocities in hypotheses.items()}
+    best, second = sorted(residuals, key=residuals.__getitem__)[:2]
+    if residuals[best] > MAX_RESIDUAL * look.speed or residuals[best] > BETTER_BY * residuals[second]:
         return None
     world = frame_named(look.world, ())
     in_ned = world is not None and world.frame is VelocityFrame.NED

@@ -44,14 +44,14 @@ class Gravity(NamedTuple):
     def of(orientation: Array, acceleration: Array) -> Gravity | None:
         """Compute from quaternions (N, 4) x, y, z, w and accelerations (N, 3) m/s²; None if too few have both."""
         quaternion = unit_quaternions(orientation)
-        use = np.isfinite(quaternion).all(axis=1) & np.isfinite(acceleration).all(axis=1)
-        size = float(np.linalg.norm(acceleration[use].mean(axis=0))) if np.count_nonzero(use) >= ENOUGH else 0.0
+        known = np.isfinite(quaternion).all(axis=1) & np.isfinite(acceleration).all(axis=1)
+        size = float(np.linalg.norm(acceleration[known].mean(axis=0))) if np.count_nonzero(known) >= ENOUGH else 0.0
         if size < LEAST:
             return None
-        a, rotation = acceleration[use] / size, rotation_from_quaternion(quaternion[use])
-        world, inverted = (np.matmul(each, a[..., None])[..., 0] for each in (rotation, rotation.swapaxes(1, 2)))
+        relative, rotation = acceleration[known] / size, rotation_from_quaternion(quaternion[known])
+        world, inverted = (np.matmul(each, relative[..., None])[..., 0] for each in (rotation, rotation.swapaxes(1, 2)))
         across = [math.sqrt(float((each[:, :2] ** 2).sum(axis=1).mean())) for each in (world, inverted)]
-        return Gravity(size, a.mean(axis=0), world.mean(axis=0), *across)
+        return Gravity(size, relative.mean(axis=0), world.mean(axis=0), *across)
 
     def contradicts(self, rotation_body_from_imu: Array, world: str, z_down: bool) -> int:
         """Return how many of the body's and the world's up direction point down under a convention (0, 1 or 2).

@@ -238,19 +238,19 @@ class CalibrationNode(AnsweringNode):
         decoder = self._feed.decoder
         _, reference, imu = decoder.frame_ids
         dvl = decoder.dvl_frame or frame_name(decoder.dvl_type.frame_id(message))
-        tried = (self._transforms.n_messages, (dvl, reference, imu))
-        if tried == self._transforms_tried:
+        placement_key = (self._transforms.n_messages, (dvl, reference, imu))
+        if placement_key == self._transforms_tried:
             return
-        self._transforms_tried = tried
+        self._transforms_tried = placement_key
         in_body = decoder.frame_of_reference is VelocityFrame.BODY
         frames = Frames(dvl, reference, imu, decoder.dvl_type.points_down, in_body)
         parameters = self._calibrator.parameters
         found = placement(self._transforms.tree(), frames, parameters, self._given)
         if found is None or parameters.replace(**found.values) == parameters:
             return
-        place = {name: value for name, value in found.values.items() if name in ("dvl_position", "reference_position")}
-        if parameters.replace(**found.values) == parameters.replace(**place):  # nothing was estimated with these values
-            self._calibrator.set_parameters(parameters.replace(**place))
+        moved = parameters.replace(**{name: at for name, at in found.values.items() if name.endswith("_position")})
+        if parameters.replace(**found.values) == moved:  # a position alone changes no estimate
+            self._calibrator.set_parameters(moved)
             return
         self.info(f"{found.said}; the calibration starts with it (set use_transforms to false to ignore it)")
         self._restart(parameters.replace(**found.values))
@@ -441,7 +441,7 @@ class CalibrationNode(AnsweringNode):
         if parameters is not None:
             self.warn(" ".join(map(str, self._late_clocks.found)))
             self._restart(parameters, self._feed)
-        if self._late_clocks.stand and not self._awaits_heading_std:
+        if self._late_clocks.is_final and not self._awaits_heading_std:
             self._feed.kept.forget()
 
     def _publish_diagnostics(self) -> None:

@@ -67,14 +67,14 @@ class RecentCounts:
         return {
             group: {
                 # a counter below its previous value was reset
-                name: count - then if (then := before.get(group, {}).get(name, 0)) <= count else count
+                name: count - previous if (previous := before.get(group, {}).get(name, 0)) <= count else count
                 for name, count in tally.items()
             }
             for group, tally in counts.items()
         }
 
 
-class _Taken(NamedTuple):
+class _LastChange(NamedTuple):
     """Number of samples taken of a stream, time of its last change (s) and of the first sample (s).
 
     dvl_ns: newest stamp of the DVL at the last change.
@@ -102,18 +102,18 @@ class Silence:
     def __init__(self, now_s: float, topics: Mapping[str, str]) -> None:
         self._topics = topics
         self._started_s = now_s
-        self._seen: dict[str, _Taken] = {}
+        self._seen: dict[str, _LastChange] = {}
 
     def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, Reason]:
         """Return the fault of each faulty stream. counts: the calibrator's current ones."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
-            lost = _NOT_TAKEN | calibrator.refusal_counters[stream]
-            used = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
+            unused_counters = _NOT_TAKEN | calibrator.refusal_counters[stream]
+            n_used = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in unused_counters)
             before = self._seen.get(stream)
-            if before is None or before.taken != used:
+            if before is None or before.taken != n_used:
                 first_s = before.first_s if before and before.taken else now_s
-                self._seen[stream] = _Taken(used, now_s, first_s, newest_ns["dvl"])
+                self._seen[stream] = _LastChange(n_used, now_s, first_s, newest_ns["dvl"])
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
         for stream, (code, own_topic) in _SILENT.items():
@@ -126,18 +126,18 @@ class Silence:
                 if stream == "reference" and model.needs is not Needs.REFERENCE:
                     code = "GNSS_OUTAGE_WITHOUT"
                 faults[stream] = finding(code, seconds=silent_s[stream], topic=topic, model=model.name)
-        coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
-        return faults | self._clock_faults(newest_ns, coming, calibrator.parameters)
+        active = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
+        return faults | self._clock_faults(newest_ns, active, calibrator.parameters)
 
     def _clock_faults(
-        self, newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters
+        self, newest_ns: Mapping[str, int | None], active: set[str], parameters: Parameters
     ) -> dict[str, Reason]:
         """Return the streams that receive samples with stamps far from the DVL's of the same moment."""
-        if "dvl" not in coming:
+        if "dvl" not in active:
             return {}
         ahead = {Stream.DVL: 0.0} | {
             Stream(stream): 1e-9 * (ns - dvl_ns)
-            for stream in coming
+            for stream in active
             if (ns := newest_ns[stream]) is not None and (dvl_ns := self._seen[stream].dvl_ns) is not None
         }
         # the newest sample of a live stream may be some time old
@@ -165,12 +165,12 @@ def diagnose(
     this process. card: further values for the operator. water: water properties, if known.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
-    grown = recent.grown(counts, now_s)
+    growth = recent.grown(counts, now_s)
     # messages sent during a pause are lost here, so they are no dropouts of the DVL
-    grown["dvl"]["dropouts"] -= min(grown["dvl"]["dropouts"], len(pauses_s))
+    growth["dvl"]["dropouts"] -= min(growth["dvl"]["dropouts"], len(pauses_s))
     found = [finding("PROCESS_PAUSED", seconds=sum(pauses_s))] if pauses_s else []
-    found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
-    found += message_warnings(grown) + recording_warnings(grown) + dvl_type.advice(grown["dvl"])
+    found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(growth)]
+    found += message_warnings(growth) + recording_warnings(growth) + dvl_type.advice(growth["dvl"])
     found += gate_warnings(estimate) + consistency_warnings(estimate)
     found += reference_warnings(estimate)
     if suggestion := calibrator.suggestion_so_far:
@@ -252,7 +252,7 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
 
 
 def _scale_and_delay_values(estimate: Estimate, parameters: Parameters) -> dict[str, str]:
-    """Return scale and delay, which ~/mounting cannot hold. Keys of states begin with std, so these do not."""
+    """Return scale and delay, which ~/mounting cannot hold, as text; σ under "sigma ...", as "std ..." is of states."""
     state = GaussianState(estimate.state, estimate.covariance)
     scale_delay = scale_and_delay(MODELS[estimate.model], state, parameters)
     values = {"scale error ahead [%]": 100.0 * scale_delay.scale, "dvl_time_offset [s]": scale_delay.time_offset}
@@ -268,19 +268,15 @@ def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
     if cause is None:
         return {}
     setting = "-" if math.isnan(cause.setting) else f"{cause.setting:.1f}"
-    return {
-        "cause of the scale": cause.sentence,
-        "speed of sound": cause.brief,
-        "speed of sound to set [m/s]": setting,
-    }
+    return {"cause of the scale": cause.sentence, "speed of sound": cause.brief, "speed of sound to set [m/s]": setting}
 
 
 def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) -> dict[str, str]:
     """Return the counts of samples by use, and of messages by stream and reason, as text."""
     values, model = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}, MODELS[estimate.model]
     if not model.from_positions:  # these models use positions instead of DVL samples
-        where = counts_by_use(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
-        values |= {f"samples {name}": str(count) for name, count in where.items()}
+        by_use = counts_by_use(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
+        values |= {f"samples {name}": str(count) for name, count in by_use.items()}
     for stream, tally in counts.items():
         for name, count in tally.items():
             values[f"{stream} {name}"] = str(count)

@@ -77,7 +77,7 @@ class ReceivingExecutor(SingleThreadedExecutor):
         self._node = node
         self._unfinished: deque[Any] = deque()  # other threads append
         self._waiting: _Waiting | None = None
-        self._once_more = False
+        self._is_more_ready = False
         self.add_node(node)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
@@ -95,17 +95,17 @@ class ReceivingExecutor(SingleThreadedExecutor):
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait until something is ready, at most `timeout_sec` seconds, and handle some of it."""
-        if self._once_more:
+        if self._is_more_ready:
             timeout_sec = 0.0
         waiting = self._waiting
         if waiting is None:
             waiting = self._waiting = _Waiting(self._node, self._woken)
         inputs, others_ready = waiting.wait(-1 if timeout_sec is None else round(timeout_sec * 1e9))
-        if others_ready or self._once_more:  # the configuration of the vehicle may come before its measurements
+        if others_ready or self._is_more_ready:  # the configuration of the vehicle may come before its measurements
             super().spin_once(timeout_sec=0.0)
         elif inputs:
             self._node.deliver(inputs)
         while self._unfinished and self._unfinished[0].done():
             self._unfinished.popleft()
         # one call handles one item, and a callback may have added more
-        self._once_more = others_ready or bool(self._unfinished)
+        self._is_more_ready = others_ready or bool(self._unfinished)

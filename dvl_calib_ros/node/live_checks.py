@@ -51,24 +51,24 @@ class GravitySeen:
 class LateClocks:
     """Clock offsets to subtract, once, if none was configured and two successive estimates agree.
 
-    found: reasons for the subtraction. stand: whether nothing more is subtracted.
+    found: reasons for the subtraction. is_final: whether nothing more is subtracted.
     """
 
     def __init__(self, given: Collection[str]) -> None:
         """Set up. given: names of the parameters that the user set."""
-        self.stand = bool(OFFSETS.keys() & set(given))
+        self.is_final = bool(OFFSETS.keys() & set(given))
         self._before: Registration | None = None
         self.found: list[Reason] = []
 
     def parameters(self, registration: Registration | None, parameters: Parameters) -> Parameters | None:
         """Return parameters with the offsets of the newest estimate for a restart, or None if nothing changes."""
-        if self.stand or registration is None or registration is self._before:
+        if self.is_final or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
         corrections = registration.corrections
         if before is None or not corrections or not _are_alike(before.corrections, corrections):
             return None
-        self.stand = True
+        self.is_final = True
         offsets = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in corrections.items()}
         self.found = [
             finding("CLOCK_TAKEN_OFF", clock=registration.clock_reason(name), parameter=name, value=seconds)

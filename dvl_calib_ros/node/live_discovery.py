@@ -64,7 +64,7 @@ class Discovering:
         self._node, self._parameters, self._worker = node, parameters, worker
         self._given = frozenset(given)
         self._recording: _Running | None = None
-        self._looked_through: Future[FoundTopics] | None = None
+        self._examination: Future[FoundTopics] | None = None
         self._said: set[str] = set()
 
     def step(self, named: Mapping[str, str | None]) -> FoundTopics | None:
@@ -73,8 +73,8 @@ class Discovering:
         named: topic by role (dvl, gnss, imu), None where it is searched. With a named DVL the frames are searched,
         until the data decide. Raises InputError if recording or reading fails.
         """
-        if self._looked_through is not None:
-            return self._outcome(self._looked_through)
+        if self._examination is not None:
+            return self._outcome(self._examination)
         if self._recording is None:
             if named["dvl"] is not None or any(self._may_be_dvl()):
                 self._begin(named)
@@ -85,13 +85,13 @@ class Discovering:
         if recorder.look() and time.monotonic() < began + LISTEN_S:
             began = time.monotonic()  # a topic that appears late is recorded as long as the others
             self._recording = self._recording._replace(began=began)
-        waits_for = LISTEN_S if all(recorder.counts[topic] >= ENOUGH for topic in recorder.topics) else MOST_S
-        if time.monotonic() < began + waits_for:
+        length_s = LISTEN_S if all(recorder.counts[topic] >= ENOUGH for topic in recorder.topics) else MOST_S
+        if time.monotonic() < began + length_s:
             return None
         self._recording = None
         ends.close()
         path = Path(folder.name) / "live"
-        self._looked_through = self._worker.submit(self._look_through, folder, path, dict(named))
+        self._examination = self._worker.submit(self._examine, folder, path, dict(named))
         return None
 
     def _may_be_dvl(self) -> list[str]:
@@ -108,9 +108,9 @@ class Discovering:
         """Start to record the topics into a temporary bag. Raises InputError without rosbags."""
         if named["dvl"] is None:
             others = ", ".join(self._may_be_dvl())
-            self._once(self._node.info, f"the DVL's topic has no publisher; examining the others ({others}) ...")
+            self._say_once(self._node.info, f"the DVL's topic has no publisher; examining the others ({others}) ...")
         else:
-            self._once(self._node.info, "the frame of the reference is unknown; comparing it with the DVL ...")
+            self._say_once(self._node.info, "the frame of the reference is unknown; comparing it with the DVL ...")
         try:
             from ..bags.writer import BagWriter
             from .topic_recorder import TopicRecorder
@@ -126,30 +126,28 @@ class Discovering:
         """Return the topics found by a finished examination; None while it runs or if it failed."""
         if not looked_through.done():
             return None
-        self._looked_through = None
+        self._examination = None
         try:
             return looked_through.result()
         except InputError as error:
-            self._once(self._node.warn, str(error))
+            self._say_once(self._node.warn, str(error))
             return None
 
-    def _once(self, say: Callable[[str], None], text: str) -> None:
+    def _say_once(self, say: Callable[[str], None], text: str) -> None:
         if text not in self._said:  # the search repeats, the message does not
             self._said.add(text)
             say(text)
 
     def close(self) -> None:
         """Stop the search."""
-        self._looked_through = None
+        self._examination = None
         if self._recording is not None:
             folder, _, ends, _ = self._recording
             self._recording = None
             ends.close()
             folder.cleanup()
 
-    def _look_through(
-        self, folder: TemporaryDirectory[str], path: Path, named: Mapping[str, str | None]
-    ) -> FoundTopics:
+    def _examine(self, folder: TemporaryDirectory[str], path: Path, named: Mapping[str, str | None]) -> FoundTopics:
         """Examine the recorded bag for topics, frames and mounting. Raises InputError."""
         from ..discovery.discover import discover
         from ..discovery.discovery import Given
@@ -163,8 +161,8 @@ class Discovering:
             except InputError as error:
                 raise InputError(str(error).replace(str(path), "the topics there are")) from error
         imu = recording.survey.looks.get(found.topics.imu)
-        turned = imu is not None and _mean_heading_length(imu.values[:, :4]) < ONE_HEADING
-        if named["dvl"] is not None and not (turned and "gnss_frame" in found.values):
+        has_turned = imu is not None and _mean_heading_length(imu.values[:, :4]) < ONE_HEADING
+        if named["dvl"] is not None and not (has_turned and "gnss_frame" in found.values):
             raise InputError("the frame of the reference is not observable yet: drive a turn, or set gnss_frame")
         # the node itself subtracts clock offsets once two estimates agree
         return FoundTopics(found, recording.of_types(found.topics, self._parameters.replace(**found.values)))

@@ -52,22 +52,22 @@ def in_order_of_arrival(
     ready: the only topics with messages a moment ago, if known. While these have no second message, the others are not
     polled: an empty poll costs a third of a message.
     """
-    heads, remaining = dict(taken), at_most
+    oldest_by_topic, remaining = dict(taken), at_most
 
     def take_more(names: Iterable[str]) -> bool:
         """Take the first waiting message of each named input without one. Return whether any arrived."""
         nonlocal remaining
         before = remaining
         for name in names:
-            if remaining and name not in heads and (arrived := take_from(inputs[name])) is not None:
-                heads[name] = arrived
+            if remaining and name not in oldest_by_topic and (arrived := take_from(inputs[name])) is not None:
+                oldest_by_topic[name] = arrived
                 remaining -= 1
         return remaining < before
 
     take_more(inputs if ready is None else ready)
-    while heads:
-        oldest = min(heads, key=lambda name: heads[name].at_ns)
-        yield oldest, heads.pop(oldest).message
+    while oldest_by_topic:
+        oldest = min(oldest_by_topic, key=lambda name: oldest_by_topic[name].at_ns)
+        yield oldest, oldest_by_topic.pop(oldest).message
         if ready is None:
             take_more(inputs)
         elif take_more(ready):  # a message that arrived meanwhile on another topic may be older

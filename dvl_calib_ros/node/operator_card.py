@@ -26,12 +26,12 @@ from ..calibration.results.results import Estimate, corrected_rpy, rpy_std, scal
 from ..verdict.reasons import Reason, finding
 
 # interval of computing the next manoeuvre, s, which takes a few milliseconds
-THOUGHT_OF_EVERY_S = 5.0
+REPLANNED_EVERY_S = 5.0
 # The predicted drift varies between looks by up to a factor of two. It is good enough after all looks within STANDS_S
 # are within the goal. It is no longer good enough when the median over STANDS_S, which is the displayed value, exceeds
-# TAKEN_BACK times the goal: a σ of 25 blocks is known to 1/7 (1σ), so a factor of 1.5 is significant. Seconds are
+# WITHDRAWN_RATIO times the goal: a σ of 25 blocks is known to 1/7 (1σ), so a factor of 1.5 is significant. Seconds are
 # counted by DVL stamps, so a fast playback counts the same and a silent DVL counts nothing.
-STANDS_S, TAKEN_BACK = 30.0, 1.5
+STANDS_S, WITHDRAWN_RATIO = 30.0, 1.5
 # Number of looks that STANDS_S needs at least, which limits the step of one: a stamp far ahead counts no more.
 LEAST_LOOKS = 5
 # 2σ of a predicted time, relative: the time is proportional to σ², which is known to 2/7 (1σ) from 25 blocks.
@@ -76,7 +76,7 @@ class RecentWorth:
         predicted = PredictedDrift(
             *(sorted(each)[len(each) // 2] for each in zip(*(d for _, d in self._looks), strict=True))
         )
-        if self.is_good and predicted.both > TAKEN_BACK * target:
+        if self.is_good and predicted.both > WITHDRAWN_RATIO * target:
             self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=predicted.both)
         if rejected or drift.both > target:
             self._within_since_s = None
@@ -98,13 +98,13 @@ class RemainingTime:
     """
 
     def __init__(self) -> None:
-        self._ends_s: deque[tuple[float, float]] = deque()
-        self._latest_s, self._longer_since_s = math.inf, -math.inf
-        self._promised_at = math.nan
+        self._ends_s: deque[tuple[float, float]] = deque()  # time of each prediction, and the predicted end
+        self._latest_s, self._longer_since_s = math.inf, -math.inf  # latest promised end
+        self._promised_at = math.nan  # drift when it was promised
         self.longer: Reason | None = None
 
     def look(self, seconds: float | None, drift: float, now_s: float) -> float | None:
-        """Return the time left. seconds: current prediction, or None. drift: m per km, as displayed."""
+        """Add a prediction (s; None: unknown). Return the median remaining time, s. drift: m per km, as displayed."""
         if now_s - self._longer_since_s >= STANDS_S:
             self.longer = None
         self._ends_s.append((now_s, math.inf if seconds is None else now_s + seconds))
@@ -134,7 +134,7 @@ class Card:
         self._squares, self._looks = 0.0, 0
         self._worth, self._remaining = RecentWorth(), RemainingTime()
         self._outlook: Outlook | None = None
-        self._thought_s = self._thought_shown_s = -math.inf
+        self._planned_s = self._planned_shown_s = -math.inf
 
     def values(
         self,
@@ -185,29 +185,29 @@ class Card:
                 sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
                 self._driven_s[SECTORS[sector]] += step
         target, worth = parameters.target_drift, self._worth
-        now = predicted_drift(model, estimate.velocity_covariance, parameters)
-        drift = worth.look(model.name, now, target, self._shown_s, rejected)
+        predicted = predicted_drift(model, estimate.velocity_covariance, parameters)
+        drift = worth.look(model.name, predicted, target, self._shown_s, rejected)
         if rejected:
-            found = Outlook(finding("NEXT_REJECTED"), None)
+            plan = Outlook(finding("NEXT_REJECTED"), None)
         elif worth.is_good:
-            found = Outlook(is_good_enough(model), None)
-        elif now.both <= target:
-            found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
+            plan = Outlook(is_good_enough(model), None)
+        elif predicted.both <= target:
+            plan = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
         elif calibrator.selection.keeps_full(parameters):
-            found = Outlook(finding("NEXT_REFERENCE", model=model.name), None)
+            plan = Outlook(finding("NEXT_REFERENCE", model=model.name), None)
         else:
-            found = self._suggestion(calibrator, estimate, motion, now_s)
+            plan = self._suggestion(calibrator, estimate, motion, now_s)
         remaining = None
         if rejected or worth.is_good:
             self._remaining = RemainingTime()
-        elif found.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
-            remaining = self._remaining.look(found.seconds, drift.both, self._shown_s)
-        unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
+        elif plan.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
+            remaining = self._remaining.look(plan.seconds, drift.both, self._shown_s)
+        initial = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goal = PredictedDrift.goals(parameters)
         goals = {
-            "side": _progress_percent(drift.side, unknown[0], goal.side),
-            "ahead": _progress_percent(drift.ahead, unknown[1], goal.ahead),
-            "worth": 100.0 if worth.is_good else min(_progress_percent(drift.both, math.hypot(*unknown), target), 99.0),
+            "side": _progress_percent(drift.side, initial[0], goal.side),
+            "ahead": _progress_percent(drift.ahead, initial[1], goal.ahead),
+            "worth": 100.0 if worth.is_good else min(_progress_percent(drift.both, math.hypot(*initial), target), 99.0),
         }
         return {
             "worth": f"{drift.both:.2f}",
@@ -216,8 +216,8 @@ class Card:
             "target": f"{target:g}",
             **{f"goal {name} [%]": f"{share:.0f}" for name, share in goals.items() if not math.isnan(share)},
             "taken back": "" if worth.taken_back is None else worth.taken_back.sentence,
-            "next": found.next.sentence,
-            "next code": found.next.code,
+            "next": plan.next.sentence,
+            "next code": plan.next.code,
             "seconds": "-" if remaining is None else f"{remaining:.0f}",
             "seconds spread": "-" if remaining is None else f"{SPREAD * remaining:.0f}",
             "longer": "" if self._remaining.longer is None else self._remaining.longer.sentence,
@@ -226,19 +226,19 @@ class Card:
     def _suggestion(
         self, calibrator: Calibrator, estimate: Estimate, motion: RecentMotion | None, now_s: float
     ) -> Outlook:
-        """Return the suggested manoeuvre, computed again after `THOUGHT_OF_EVERY_S`."""
-        if self._outlook is None or now_s - self._thought_s >= THOUGHT_OF_EVERY_S:
-            self._thought_s, self._thought_shown_s = now_s, self._shown_s
+        """Return the suggested manoeuvre, computed again after `REPLANNED_EVERY_S`."""
+        if self._outlook is None or now_s - self._planned_s >= REPLANNED_EVERY_S:
+            self._planned_s, self._planned_shown_s = now_s, self._shown_s
             parameters, mean_square = calibrator.parameters, self._squares / max(self._looks, 1)
             first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
             seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
             noise = noise_of_a_second(estimate, parameters, seconds, mean_square)
-            still = RecentMotion(0.0, None, False, noise)
-            moving = still if motion is None else motion._replace(noise=noise)
-            if moving.speed > 0.0:  # if the vehicle slows down in a turn, its usual speed
-                moving = moving._replace(speed=max(moving.speed, math.sqrt(mean_square)))
-            self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
-        planned, since = self._outlook.seconds, self._shown_s - self._thought_shown_s
+            standing = RecentMotion(0.0, None, False, noise)
+            usual_motion = standing if motion is None else motion._replace(noise=noise)
+            if usual_motion.speed > 0.0:  # if the vehicle slows down in a turn, its usual speed
+                usual_motion = usual_motion._replace(speed=max(usual_motion.speed, math.sqrt(mean_square)))
+            self._outlook = outlook(estimate, parameters, usual_motion, self._outlook and self._outlook.next)
+        planned, since = self._outlook.seconds, self._shown_s - self._planned_shown_s
         return self._outlook._replace(seconds=None if planned is None else max(planned - since, 0.0) + STANDS_S)
 
 
@@ -254,16 +254,17 @@ def _mounting(calibrator: Calibrator, estimate: Estimate) -> dict[str, str]:
     parameters, model = calibrator.parameters, MODELS[estimate.model]
     angles = np.degrees(corrected_rpy(estimate.misalignment, parameters))
     stds = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))
-    found = {name: (a, s, "deg") for name, a, s in zip(("roll", "pitch", "yaw"), angles, stds, strict=True)}
+    named = zip(("roll", "pitch", "yaw"), angles, stds, strict=True)
+    quantities = {name: (angle, angle_std, "deg") for name, angle, angle_std in named}
     arm = estimate.lever_arm(parameters.lever_arm)
     arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
     for index, axis in enumerate("xyz"):
-        found[f"arm {axis}"] = (arm[index], math.nan if arm_std is None else arm_std[index], "m")
+        quantities[f"arm {axis}"] = (arm[index], math.nan if arm_std is None else arm_std[index], "m")
     scale_delay = scale_and_delay(model, GaussianState(estimate.state, estimate.covariance), parameters)
-    found["scale"] = (100.0 * scale_delay.scale, 100.0 * (scale_delay.scale_std or math.nan), "%")
-    found["delay"] = (scale_delay.time_offset, scale_delay.time_offset_std or math.nan, "s")
+    quantities["scale"] = (100.0 * scale_delay.scale, 100.0 * (scale_delay.scale_std or math.nan), "%")
+    quantities["delay"] = (scale_delay.time_offset, scale_delay.time_offset_std or math.nan, "s")
     values = {}
-    for name, (value, std, unit) in found.items():
+    for name, (value, std, unit) in quantities.items():
         values[f"mounting {name} [{unit}]"] = f"{value:.3f}"
         values[f"sigma mounting {name} [{unit}]"] = "not estimated" if math.isnan(std) else f"{std:.3f}"
     return values

@@ -46,18 +46,18 @@ def declare_parameters(node: AnsweringNode, files: Sequence[Path] = ()) -> Param
     integers are accepted for doubles, now and later. files: the parameter files of the start. Unknown names in their
     sections for all nodes belong to other nodes.
     """
-    others: set[str] = set()
+    names_elsewhere: set[str] = set()
     for path in files:
-        others |= names_of_others(path, node.get_fully_qualified_name())
+        names_elsewhere |= names_of_others(path, node.get_fully_qualified_name())
     given: dict[str, Any] = {
         name: node.get_parameter(name).value for name in node.get_parameters_by_prefix("") if not is_ros_parameter(name)
     }
     for name in given:
         node.undeclare_parameter(name)
-    foreign = sorted(others & given.keys())
-    if foreign:
-        node.info(f"not ours, though set for all nodes: {', '.join(foreign)}")
-    parameters = Parameters.from_mapping({name: value for name, value in given.items() if name not in others})
+    ignored = sorted(names_elsewhere & given.keys())
+    if ignored:
+        node.info(f"not ours, though set for all nodes: {', '.join(ignored)}")
+    parameters = Parameters.from_mapping({name: value for name, value in given.items() if name not in names_elsewhere})
     for name, spec in SCHEMA.items():
         node.declare_parameter(name, parameters.as_dict()[name], descriptor(spec), ignore_override=True)
     node.add_pre_set_parameters_callback(_as_declared)

@@ -71,5 +71,5 @@ def _create_or_refuse(topic: str, make: Callable[[], Any]) -> Any:
     except Exception as error:
         why = " ".join(str(error).split())
         raise InputError(
-            f"topic {topic!r} cannot be had ({why}); name another: one for each sensor, of letters, digits, _ and /"
+            f"topic {topic!r} cannot be used ({why}); name another: one for each sensor, of letters, digits, _ and /"
         ) from error

@@ -75,9 +75,9 @@ class TopicRecorder:
             text, _ = self._writer.typestore.generate_msgdef(kind, ros_version=2)
             definition = Definition(MessageDefinitionFormat.MSG, text)
         channel = Channel(topic, kind, definition)
-        taken = partial(self._write_message, channel)
+        on_message = partial(self._write_message, channel)
         self._subscriptions.append(
-            self._node.create_subscription(message_class(topic, kind), topic, taken, profile, raw=True)
+            self._node.create_subscription(message_class(topic, kind), topic, on_message, profile, raw=True)
         )
 
     def close(self) -> None:

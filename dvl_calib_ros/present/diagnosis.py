@@ -133,7 +133,7 @@ def diagnosis(d: Diagnosis) -> Document:
     known = [(each.name, EFFECTS[each.name].remedy) for each in d.effects if each.name in EFFECTS and each.is_certain]
     to_do = [f"To do for {name}: {remedy}." for name, remedy in known if remedy]
     more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
-    of_each = [
+    by_recording = [
         (effect.name, recording, intervals(parameters, EFFECTS.get(effect.name)))
         for effect in d.effects
         for recording, parameters in effect.by_recording.items()
@@ -160,7 +160,7 @@ def diagnosis(d: Diagnosis) -> Document:
             section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
             section("", Warned(), where=Where.PAGE),
             section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
-            section("", Table(("effect", "recording", "parameters (95 %)"), of_each, words=3)),
+            section("", Table(("effect", "recording", "parameters (95 %)"), by_recording, words=3)),
             section("", closed if has_effects and math.isfinite(d.gap.closure) else None, where=Where.PAGE),
             section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
             section("" if d.where else "Regimes of motion", regimes, where=Where.PAGE),

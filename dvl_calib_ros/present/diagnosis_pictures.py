@@ -282,10 +282,10 @@ def trace_pictures(name: str, series: DiagnosisSeries, axes: Mapping[str, str]) 
     trace = series.traces[name]
     measured = series.held_out.after + trace
     energy = (trace**2).sum(axis=0)
-    smooth = [float(np.nansum(running_mean(stamps_ns, each, points)[1] ** 2)) for each in trace.T]
+    smooth_energy = [float(np.nansum(running_mean(stamps_ns, each, points)[1] ** 2)) for each in trace.T]
     for name_of_axis, where in axes.items():
         axis = "xyz".index(name_of_axis)
-        if smooth[axis] > AXIS_SHARE * sum(smooth):
+        if smooth_energy[axis] > AXIS_SHARE * sum(smooth_energy):
             lines = {"measured": measured[:, axis], name: trace[:, axis]}
             yield picture(
                 f"{name}, {where}", f"Measured trace {where} and the trace of {name}, running mean in mm/s",

@@ -144,9 +144,9 @@ T = TypeVar("T")
 Columns = Mapping[str, Callable[[T], str | Cell]]
 
 
-def table_by(columns: Columns[T], of: Iterable[T], notes: Sequence[str] = (), words: int = 1) -> Table:
+def table_by(columns: Columns[T], objects: Iterable[T], notes: Sequence[str] = (), words: int = 1) -> Table:
     """Return a table with a row per object. Headings of text columns are aligned like their texts."""
-    rows = [[column(each) for column in columns.values()] for each in of]
+    rows = [[column(each) for column in columns.values()] for each in objects]
     texts = [isinstance(cell, Cell) and cell.kind.startswith("text") for cell in rows[0]] if rows else ()
     head = [Cell(name, "text") if is_text else name for name, is_text in zip(columns, texts, strict=False)]
     return Table(head, rows, notes=notes, words=words)
@@ -205,7 +205,7 @@ class SideBySide:
 
     def draw(self) -> Sequence[Picture]:
         """Draw the pictures."""
-        return [each for of in self.figures for each in of.draw()]
+        return [each for each_figures in self.figures for each in each_figures.draw()]
 
 
 def figures(function: str, *given: Any) -> Figures:
@@ -241,9 +241,9 @@ class Facts(_Printable):
     facts: Mapping[str, str]
 
 
-def facts_by(facts: Mapping[str, Callable[[T], str]], of: T) -> Facts:
+def facts_by(facts: Mapping[str, Callable[[T], str]], described: T) -> Facts:
     """Return the facts of an object, each from its function."""
-    return Facts({name: fact(of) for name, fact in facts.items()})
+    return Facts({name: fact(described) for name, fact in facts.items()})
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,8 @@ def _scores(e: Evaluation) -> Iterable[Item]:
         )
     yield Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
     base = e.columns.index(UNCALIBRATED)
-    gains, gains_published = (1.0 - e.of_models(of) / of[:, [base]] for of in (e.seed_mean, e.published_of_these))
+    both_vrmse = (e.seed_mean, e.published_of_these)
+    gains, gains_published = (1.0 - e.of_models(vrmse) / vrmse[:, [base]] for vrmse in both_vrmse)
     text = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gains.mean(axis=0), strict=True))
     yield figure(
         "evaluation_figures.improvement_bars",
@@ -258,9 +259,9 @@ def _single_run_study(e: Evaluation, study: EachStudy, title: str) -> Section:
     for run, label, values, observed in zip(
         study.runs, study.run_names, study.seed_mean.tolist(), study.yaw_observed.tolist(), strict=True
     ):
-        seen = dict(zip(e.models, observed, strict=True))
+        share_by_model = dict(zip(e.models, observed, strict=True))
         cells = [
-            number(value, 4) + (" ?" if math.isfinite(value) and seen.get(name, 1.0) < 0.5 else "")
+            number(value, 4) + (" ?" if math.isfinite(value) and share_by_model.get(name, 1.0) < 0.5 else "")
             for name, value in zip(e.columns, values, strict=True)
         ]
         rows.append((label, f"{math.degrees(run.heading_spread):.0f}", *cells))

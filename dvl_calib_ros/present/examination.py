@@ -34,7 +34,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     notes = (note.sentence for note in discovery.notes)
     lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
-    also = "else " if lead or examined.notes else ""
+    otherwise = "else " if lead or examined.notes else ""
     nothing = NO_SAMPLE if examined.has_reference else NO_REFERENCE
     return Document(
         title="Examination of a recording",
@@ -44,7 +44,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
         sections=[
             Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *lines]),
             Section(
-                f"Findings: {len(found)}" if found else f"Nothing {also}wrong was found",
+                f"Findings: {len(found)}" if found else f"Nothing {otherwise}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(

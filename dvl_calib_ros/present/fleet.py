@@ -61,11 +61,11 @@ def fleet(result: Fleet) -> Document:
         sentences = ["No vehicle has an angle that is observable on two days, so nothing can be compared."]
     sentences.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
-    sitting = [
+    current = [
         VehicleNow(each, now(each), [person for person in result.persons if person.vehicle == each.name])
         for each in vehicles
     ]
-    sitting.sort(key=lambda each: each.urgency)
+    current.sort(key=lambda each: each.urgency)
     speeds = [
         VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.value[SCALE]))
         for each in vehicles
@@ -90,8 +90,8 @@ def fleet(result: Fleet) -> Document:
             Section(
                 "Vehicles",
                 [
-                    *(Sentence(f"{each.history.name}: {each.word}. {each.why}") for each in sitting),
-                    replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True),
+                    *(Sentence(f"{each.history.name}: {each.word}. {each.why}") for each in current),
+                    replace(table_by(VEHICLES, current, (MOUNTING_NOTE,)), dense=True),
                 ],
             ),
             section(
@@ -100,7 +100,7 @@ def fleet(result: Fleet) -> Document:
             ),
             *(
                 _trend_section(each.history.name, each.history.compared)
-                for each in sitting
+                for each in current
                 if each.history.compared is not None
             ),
             section(

@@ -78,12 +78,12 @@ def quantity(values: Sequence[float], unit: str) -> tuple[list[float], str]:
     return [factor * each for each in values], unit_shown
 
 
-def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffect | None = None) -> str:
+def intervals(parameters: Mapping[str, tuple[float, float, float]], effect: AnyEffect | None = None) -> str:
     """Format values with their intervals, by name, to the digits that the intervals justify; – for none.
 
-    of: the effect of the parameters, if known here.
+    effect: the effect of the parameters, if known here.
     """
-    specs = {} if of is None else {each.name: each for each in of.parameters}
+    specs = {} if effect is None else {each.name: each for each in effect.parameters}
     texts = []
     for name, values in parameters.items():
         label, unit = (specs[name].display_name, specs[name].unit) if name in specs else (name, "")

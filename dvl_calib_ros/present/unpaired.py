@@ -83,7 +83,7 @@ def unpaired(found: UnpairedComparison | ClosedGap) -> Document:
     by_round = table_by(ROUNDS, compared, (ROUNDS_NOTE.format(mm(c.floor_mps), closed.best),), words=3)
     effects = table_by(EFFECTS, c.effects, (EFFECTS_NOTE,), words=len(EFFECTS))
     rungs = table_by(RUNGS, c.rungs, (RUNGS_NOTE.format(mm(c.floor_mps)),))
-    levels = [(name, *map(mm, both)) for name, both in c.levels.items()]
+    levels = [(name, *map(mm, values)) for name, values in c.levels.items()]
     sides = {"vehicle": c.vehicle, "simulator": c.simulator}
     names = sorted({name for side in c.not_shown.values() for name in side})
     unseen = [(name, *(side.get(name, "would have shown") for side in c.not_shown.values())) for name in names]

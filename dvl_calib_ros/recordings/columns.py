@@ -155,14 +155,14 @@ class Singles:
                 stamps_ns[of_channel] = self._header_stamps_ns(of_channel)
         return stamps_ns
 
-    def _header_stamps_ns(self, at: Index) -> Stamps:
+    def _header_stamps_ns(self, rows: Index) -> Stamps:
         """Read only the stamps of messages that begin with a header (CDR)."""
-        starts = np.where(at > 0, self.end[at - 1], 0)
-        whole = self.end[at] - starts >= STAMP_END
-        head = self.content[np.where(whole, starts, 0)[:, None] + np.arange(STAMP_END if whole.any() else 0)]
-        stamps_ns = np.zeros(len(at), dtype=np.int64)
-        for order, number in (("<", 1), (">", 0)):
-            readable = whole & ((head[:, :1] == 0) & (head[:, 1:2] == number)).any(axis=1)
+        starts = np.where(rows > 0, self.end[rows - 1], 0)
+        is_whole = self.end[rows] - starts >= STAMP_END
+        head = self.content[np.where(is_whole, starts, 0)[:, None] + np.arange(STAMP_END if is_whole.any() else 0)]
+        stamps_ns = np.zeros(len(rows), dtype=np.int64)
+        for order, flag in (("<", 1), (">", 0)):
+            readable = is_whole & ((head[:, :1] == 0) & (head[:, 1:2] == flag)).any(axis=1)
             seconds, nanoseconds = (
                 np.ascontiguousarray(head[readable, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
                 for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))

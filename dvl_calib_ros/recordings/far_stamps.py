@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
-from itertools import chain
 
 import numpy as np
 
@@ -34,7 +33,7 @@ OTHER_DELAY = 10.0
 Span = tuple[int, int]
 
 
-def far(each: Sequence[Stamps]) -> list[Mask]:
+def far(streams: Sequence[Stamps]) -> list[Mask]:
     """Return, per stream, which stamps lie in a segment that must be removed.
 
     Segments are formed from all streams together. A stream keeps the segment shared by most streams, among those with
@@ -42,29 +41,29 @@ def far(each: Sequence[Stamps]) -> list[Mask]:
 
     Parameters
     ----------
-    each: Stamps (N,) ns of each stream, in any order.
+    streams: Stamps (N,) ns of each stream, in any order.
     """
-    none = [np.zeros(len(stamps_ns), dtype=bool) for stamps_ns in each]
-    given = [stamps_ns for stamps_ns in each if len(stamps_ns)]
-    if not given or max(int(part.max()) for part in given) - min(int(part.min()) for part in given) <= SEGMENT_GAP_NS:
-        return none
-    in_order = np.sort(np.concatenate(given))
-    breaks = np.flatnonzero(np.diff(in_order) > SEGMENT_GAP_NS) + 1
+    nothing_far = [np.zeros(len(stamps_ns), dtype=bool) for stamps_ns in streams]
+    spans = [(int(stamps_ns.min()), int(stamps_ns.max())) for stamps_ns in streams if len(stamps_ns)]
+    if not spans or max(last for _, last in spans) - min(first for first, _ in spans) <= SEGMENT_GAP_NS:
+        return nothing_far
+    ascending = np.sort(np.concatenate(streams))
+    breaks = np.flatnonzero(np.diff(ascending) > SEGMENT_GAP_NS) + 1
     if not len(breaks):
-        return none
-    starts, ends = in_order[np.append(0, breaks)], in_order[np.append(breaks, len(in_order)) - 1]
-    segment_of = [np.searchsorted(starts, part, side="right") - 1 for part in each]
-    shares = np.array([np.bincount(of, minlength=len(starts)) / max(len(of), 1) for of in segment_of])
+        return nothing_far
+    starts, ends = ascending[np.append(0, breaks)], ascending[np.append(breaks, len(ascending)) - 1]
+    segment_of = [np.searchsorted(starts, part, side="right") - 1 for part in streams]
+    shares = np.array([np.bincount(segments, minlength=len(starts)) / max(len(segments), 1) for segments in segment_of])
     weights = shares.sum(axis=0)
-    found = []
-    for of, share in zip(segment_of, shares, strict=True):
-        large = share >= min(SMALL_SHARE, share.max())
-        main = int(np.argmax(np.where(large, weights, -1.0)))
-        apart_ns = np.maximum(starts - ends[main], starts[main] - ends)
-        aside = ~large | (apart_ns > FURTHEST_NS)
-        aside[main] = False
-        found.append(aside[of])
-    return found
+    masks = []
+    for segments, share in zip(segment_of, shares, strict=True):
+        is_large = share >= min(SMALL_SHARE, share.max())
+        main = int(np.argmax(np.where(is_large, weights, -1.0)))
+        distances_ns = np.maximum(starts - ends[main], starts[main] - ends)
+        is_removed = ~is_large | (distances_ns > FURTHEST_NS)
+        is_removed[main] = False
+        masks.append(is_removed[segments])
+    return masks
 
 
 def logged_elsewhere(stamps_ns: Sequence[Stamps], log_ns: Sequence[Stamps]) -> list[Mask]:
@@ -78,27 +77,27 @@ def logged_elsewhere(stamps_ns: Sequence[Stamps], log_ns: Sequence[Stamps]) -> l
     stamps_ns: Stamps (N,) ns of each stream.
     log_ns: Log times (N,) ns of the same messages.
     """
-    found, due_ns = [], []
+    masks, expected_ns = [], []
     for stamps, logged in zip(stamps_ns, log_ns, strict=True):
-        other = np.zeros(len(logged), dtype=bool)
-        due: Array = logged.astype(float)
-        if len(logged) > 2 and float(np.diff(due).max()) > LEAST_PAUSE_NS:
-            delay = due - stamps
-            usual = float(median(delay))
-            off = np.abs(delay - usual)
-            other = off > max(LEAST_PAUSE_NS, OTHER_DELAY * float(median(off)))
-            other &= np.count_nonzero(other) <= max(SMALL_SHARE * len(other), 1)
-            due -= delay - usual
-        found.append(other)
-        due_ns.append(due)
-    sound = [logged[~other] for logged, other in zip(log_ns, found, strict=True) if not other.all()]
-    if not any(other.any() for other in found) or not sound:
-        return found
-    first = min(int(own.min()) for own in sound) - LEAST_PAUSE_NS
-    last = max(int(own.max()) for own in sound) + LEAST_PAUSE_NS
+        is_other = np.zeros(len(logged), dtype=bool)
+        expected: Array = logged.astype(float)
+        if len(logged) > 2 and float(np.diff(expected).max()) > LEAST_PAUSE_NS:
+            delay = expected - stamps
+            typical = float(median(delay))
+            deviation = np.abs(delay - typical)
+            is_other = deviation > max(LEAST_PAUSE_NS, OTHER_DELAY * float(median(deviation)))
+            is_other &= np.count_nonzero(is_other) <= max(SMALL_SHARE * len(is_other), 1)
+            expected -= delay - typical
+        masks.append(is_other)
+        expected_ns.append(expected)
+    trusted = [logged[~is_other] for logged, is_other in zip(log_ns, masks, strict=True) if not is_other.all()]
+    if not any(is_other.any() for is_other in masks) or not trusted:
+        return masks
+    first = min(int(part.min()) for part in trusted) - LEAST_PAUSE_NS
+    last = max(int(part.max()) for part in trusted) + LEAST_PAUSE_NS
     return [
-        other & ((logged < first) | (logged > last)) & (due >= first) & (due <= last)
-        for other, logged, due in zip(found, log_ns, due_ns, strict=True)
+        is_other & ((logged < first) | (logged > last)) & (expected >= first) & (expected <= last)
+        for is_other, logged, expected in zip(masks, log_ns, expected_ns, strict=True)
     ]
 
 
@@ -121,24 +120,25 @@ def without_far(
     names = [name for name, part in columns.items() if len(part)]
     log_ns = [columns[name].arrivals[1] for name in names]
     joined = np.concatenate([np.zeros(0, dtype=np.int64), *log_ns])
-    [by_log] = far([joined])
-    of_log = np.split(by_log, np.cumsum([len(own) for own in log_ns])[:-1]) if names else []
+    [is_log_far] = far([joined])
+    log_masks = np.split(is_log_far, np.cumsum([len(stamps) for stamps in log_ns])[:-1]) if names else []
     # a topic that is far as a whole has another clock, which is detected and reported later
-    of_log = [np.zeros_like(own) if len(own) >= FEWEST_OF_A_CLOCK and own.all() else own for own in of_log]
+    log_masks = [np.zeros_like(own) if len(own) >= FEWEST_OF_A_CLOCK and own.all() else own for own in log_masks]
     stamps_ns = [columns[name].stamps_ns for name in names]
-    of_log = [own | other for own, other in zip(of_log, logged_elsewhere(stamps_ns, log_ns), strict=True)]
-    by_log = np.concatenate([by_log[:0], *of_log])
+    log_masks = [own | wrong for own, wrong in zip(log_masks, logged_elsewhere(stamps_ns, log_ns), strict=True)]
+    is_log_far = np.concatenate([is_log_far[:0], *log_masks])
     # messages with wrong log times may have stamps of the same clock: they do not count
-    of_stamps = far([own[~aside] for own, aside in zip(stamps_ns, of_log, strict=True)])
+    stamp_masks = far([stamps[~is_removed] for stamps, is_removed in zip(stamps_ns, log_masks, strict=True)])
     kept = dict(columns)
     findings: list[Reason] = []
-    for name, own, own_log, recorded, stamped in zip(names, stamps_ns, log_ns, of_log, of_stamps, strict=True):
-        aside = recorded.copy()
-        aside[~recorded] = stamped
-        findings += chain(_named(name, "recorded", own_log, recorded), _named(name, "stamped", own, aside & ~recorded))
-        if aside.any():
-            kept[name] = columns[name].part(~aside)
-    return kept, tuple(_within(spans_ns, joined[~by_log], set(joined[by_log].tolist()))), findings
+    for name, stamps, logged, by_log, by_stamp in zip(names, stamps_ns, log_ns, log_masks, stamp_masks, strict=True):
+        is_removed = by_log.copy()
+        is_removed[~by_log] = by_stamp  # by_stamp has only the messages with good log times
+        findings += _named(name, "recorded", logged, by_log)
+        findings += _named(name, "stamped", stamps, is_removed & ~by_log)
+        if is_removed.any():
+            kept[name] = columns[name].part(~is_removed)
+    return kept, tuple(_within(spans_ns, joined[~is_log_far], set(joined[is_log_far].tolist()))), findings
 
 
 def _named(topic: str, how: str, times_ns: Stamps, aside: Mask) -> Iterator[Reason]:

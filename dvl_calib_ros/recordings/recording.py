@@ -50,14 +50,11 @@ Span = tuple[int, int]
 class Recording:
     """One recording, or several as one.
 
-    paths: paths of the recording. types: topic -> message type, of all topics. held: topic -> all its types. counts:
-        topic
-    -> number of messages. file_spans_ns: of each file with a message. notes: messages to the user on damage. columns:
-        of
-    the topics that are kept, one part per path. transforms: of tf_static. descriptions: of robot_description. parts:
-        the
-    recordings it was joined from, if any. registrations: cached results of `register_as`. waters: its water properties.
-    field_maps: topic of an unlisted type -> field map for its likely velocity.
+    types: topic -> message type. held: topic -> all its types. counts: topic -> number of messages. file_spans_ns: of
+    each file with a message. notes: messages to the user on damage. columns: of the topics that are kept, one part per
+    path. transforms: of tf_static. descriptions: of robot_description. parts: the recordings it was joined from, if
+    any. registrations: cached results of `register_as`. waters: its water properties. field_maps: topic of an unlisted
+    type -> field map for its likely velocity.
     """
 
     paths: tuple[Path, ...]
@@ -140,20 +137,20 @@ class Recording:
         return self._surveyed({name: self.columns[name] for name in named if name in self.columns}, whole=True)
 
     def _surveyed(self, columns: Mapping[str, tuple[TopicColumns, ...]], *, whole: bool) -> Survey:
-        """Return the previews of topics, and why messages of the others cannot be read."""
+        """Return the previews of readable topics; of the others the reason why their first message cannot be read."""
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
         looks = {
             topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
                            spans_ns, whole=whole)
             for topic, parts in columns.items()
         }  # fmt: skip
-        seen = {topic: look for topic, look in looks.items() if look is not None}
+        read = {topic: look for topic, look in looks.items() if look is not None}
         unread = {
-            topic: why
-            for topic, parts in columns.items() if topic not in seen
-            for *_, why in islice((row for part in parts for row in part.singles.messages(slice(1))), 1) if why
+            topic: reason
+            for topic, parts in columns.items() if topic not in read
+            for *_, reason in islice((row for part in parts for row in part.singles.messages(slice(1))), 1) if reason
         }  # fmt: skip
-        return Survey(self.types, self.counts, seen, self.transforms, self.descriptions, unread, self.field_maps)
+        return Survey(self.types, self.counts, read, self.transforms, self.descriptions, unread, self.field_maps)
 
     def water(self, topics: Topics) -> Water | None:
         """Return the water properties and the speed of sound used by the DVL; None if unknown."""
@@ -277,16 +274,16 @@ def _renumbered(each: Sequence[Recording], names: Collection[str]) -> dict[str, 
         order = np.argsort(arrival, kind="stable")
         arrivals.append(arrival[order])
         logs.append(log_ns[order])
-    place = np.empty(sum(map(len, logs)), dtype=np.int64)
-    place[np.argsort(np.concatenate(logs), kind="stable")] = np.arange(len(place))
+    new_arrival = np.empty(sum(map(len, logs)), dtype=np.int64)
+    new_arrival[np.argsort(np.concatenate(logs), kind="stable")] = np.arange(len(new_arrival))
     columns: dict[str, list[TopicColumns]] = {name: [] for name in names if any(name in one.columns for one in each)}
     at = 0
     for one, arrival in zip(each, arrivals, strict=True):
-        own = place[at : at + len(arrival)]
+        new_arrivals = new_arrival[at : at + len(arrival)]
         at += len(arrival)
 
-        def renumbered(of: Stamps, arrival: Stamps = arrival, own: Stamps = own) -> Stamps:
-            return np.asarray(own[np.searchsorted(arrival, of)])
+        def renumbered(old_arrivals: Stamps, arrival: Stamps = arrival, new_arrivals: Stamps = new_arrivals) -> Stamps:
+            return np.asarray(new_arrivals[np.searchsorted(arrival, old_arrivals)])
 
         for name, parts in one.columns.items():
             columns[name] += [part.arriving(renumbered) for part in parts]
@@ -301,30 +298,32 @@ def _read(
 ) -> Recording:
     """Read a bag window by window: columns of moving topics, static transforms, descriptions, water readings."""
     types = bag.topics
-    moving = {topic for topic, kind in types.items() if is_kept(kind)}
-    static = {topic for topic, kind in types.items() if is_static(topic, kind)}
+    sensor_topics = {topic for topic, kind in types.items() if is_kept(kind)}
+    static_topics = {topic for topic, kind in types.items() if is_static(topic, kind)}
     if topics is not None:
         found = topics.found_in(types)
-        moving, static = moving & {found.dvl, found.gnss, found.imu}, set()
-    waters = {topic: WaterCollector(topic, kind) for topic, kind in types.items() if readers(topic, kind)}
+        sensor_topics, static_topics = sensor_topics & {found.dvl, found.gnss, found.imu}, set()
+    water_collectors = {topic: WaterCollector(topic, kind) for topic, kind in types.items() if readers(topic, kind)}
     one_by_one = (
-        static | {topic for topic in moving if not _is_read_in_columns(types[topic])} | (waters.keys() - moving)
+        static_topics
+        | {topic for topic in sensor_topics if not _is_read_in_columns(types[topic])}
+        | (water_collectors.keys() - sensor_topics)
     )
     counts = bag.message_counts
     collectors = {
-        topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(moving)
+        topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(sensor_topics)
     }
-    still_to_read = dict.fromkeys(static, MOST_STATIC)
+    still_to_read = dict.fromkeys(static_topics, MOST_STATIC)
     transforms: list[Any] = []
     descriptions: list[str] = []
     start_ns, end_ns = bag.span_ns
-    for window in windows(bag, moving | static | waters.keys(), one_by_one):
+    for window in windows(bag, sensor_topics | static_topics | water_collectors.keys(), one_by_one):
         for part in window.parts:
             topic = part.channel.topic
-            if topic in waters:
+            if topic in water_collectors:
                 for message, _ in islice(part.messages(), WATER_OF_WINDOW):
                     if message is not None:
-                        waters[topic].add(message)
+                        water_collectors[topic].add(message)
                 if topic not in collectors:
                     continue
             if topic in collectors:
@@ -340,7 +339,7 @@ def _read(
     columns = {topic: collector.columns() for topic, collector in collectors.items()}
     for topic in _restamped(columns, parameters.restamp, path):
         columns[topic] = columns[topic].restamped()
-    kept, file_spans_ns, aside = without_far(columns, bag.file_spans_ns)
+    kept, file_spans_ns, far_findings = without_far(columns, bag.file_spans_ns)
     counts.subtract({topic: len(columns[topic]) - len(column) for topic, column in kept.items()})
     held = {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types}
     imus = [column for column in kept.values() if column.msgtype == IMU_TYPE]
@@ -354,11 +353,11 @@ def _read(
         held,
         counts,
         file_spans_ns,
-        (*bag.notes, *map(str, aside)),
+        (*bag.notes, *map(str, far_findings)),
         {topic: (column,) for topic, column in kept.items()},
         tuple(transforms),
         tuple(dict.fromkeys(descriptions)),
-        waters=tuple(reading for each in waters.values() for reading in each.readings()),
+        waters=tuple(reading for each in water_collectors.values() for reading in each.readings()),
         field_maps=_field_maps(bag),
     )
 
@@ -447,16 +446,16 @@ def orientations_of(poses: TopicColumns) -> TopicColumns | None:
     values[~_are_unit(values)] = np.nan
     if not hold_orientations(values):
         return None
-    good = np.flatnonzero(np.isfinite(values[:, 0]))
+    known = np.flatnonzero(np.isfinite(values[:, 0]))
     (arrival, log_ns), stamps_ns = poses.arrivals, poses.stamps_ns
-    values[good, 4:] = _turn_rates(stamps_ns[good], values[good, :4])
+    values[known, 4:] = _turn_rates(stamps_ns[known], values[known, :4])
     n = len(poses)
     laid = Laid(
         arrival, log_ns, stamps_ns, values, np.zeros(n, dtype=np.int32), np.full(n, -1, dtype=np.int32),
         np.zeros(n, dtype=np.uint8), np.full((n, 3), np.nan), frames=("",),
     )  # fmt: skip
-    nothing = poses.singles.part(np.zeros(0, dtype=np.intp))
-    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, laid, nothing)
+    no_singles = poses.singles.part(np.zeros(0, dtype=np.intp))
+    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, laid, no_singles)
 
 
 def hold_orientations(values: Array) -> bool:
@@ -477,8 +476,9 @@ def _turn_rates(stamps_ns: Stamps, quaternions: Array) -> Array:
     time = 1e-9 * (stamps_ns[order] - stamps_ns.min())
     first = np.searchsorted(time, time - 0.5 * RATE_WINDOW_S)
     last = np.searchsorted(time, time + 0.5 * RATE_WINDOW_S, side="right") - 1
-    alone = first == last  # in slow streams, difference to the neighbours
-    first, last = np.where(alone, first - 1, first).clip(0), np.where(alone, last + 1, last).clip(max=len(time) - 1)
+    is_single = first == last  # in slow streams, difference to the neighbours
+    first = np.where(is_single, first - 1, first).clip(0)
+    last = np.where(is_single, last + 1, last).clip(max=len(time) - 1)
     turns = Rotation.from_quat(quaternions[order])
     seconds = (time[last] - time[first])[:, None]
     rates = np.empty((len(time), 3))
@@ -544,14 +544,14 @@ def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
     return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
 
 
-def hold_the_same(one: Recorded, other: Recorded) -> bool:
+def hold_the_same(recorded: Recorded, other_recorded: Recorded) -> bool:
     """Return whether half of one recording's DVL velocities are in the other, at the same stamps."""
-    (stamps, values), (its_stamps, its_values) = _velocities(one), _velocities(other)
-    if not len(stamps) or not len(its_stamps):
+    (stamps, values), (other_stamps, other_values) = _velocities(recorded), _velocities(other_recorded)
+    if not len(stamps) or not len(other_stamps):
         return False
-    at = np.minimum(np.searchsorted(its_stamps, stamps), len(its_stamps) - 1)
-    same = (its_stamps[at] == stamps) & (its_values[at] == values).all(axis=1)
-    return bool(2 * np.count_nonzero(same) > min(len(stamps), len(its_stamps)))
+    matching = np.minimum(np.searchsorted(other_stamps, stamps), len(other_stamps) - 1)
+    is_same = (other_stamps[matching] == stamps) & (other_values[matching] == values).all(axis=1)
+    return bool(2 * np.count_nonzero(is_same) > min(len(stamps), len(other_stamps)))
 
 
 def _velocities(topic: Recorded) -> tuple[Stamps, Array]:

@@ -60,16 +60,16 @@ def stretches(
     if share < 1.0:  # samples after a gap are processed individually, which must be a small part of a window
         at_once = min(at_once, 1 + int(len(arrival) * share / (WINDOWS * STRETCHES_OF_A_WINDOW)))
     ends = [*arrival[at_once::at_once].tolist(), int(arrival[-1]) + 1] if len(arrival) else []
-    cut = {stream: [_Cut(part, ends) for part in columns.get(stream, ())] for stream in Stream}
+    cuts = {stream: [_Cut(part, ends) for part in columns.get(stream, ())] for stream in Stream}
     for index in range(len(ends)):
         if (len(ends) - 1 - index) * WINDOWS % len(ends) >= share * len(ends):
             continue
-        log_ns = max(each.newest_ns(index) for cuts in cut.values() for each in cuts)
+        log_ns = max(each.newest_ns(index) for parts in cuts.values() for each in parts)
         dvl, reference, imu = (
             _block(
                 stream,
-                [laid for each in cut[stream] if len(laid := each.laid(index))],
-                [each.singles(index) for each in cut[stream]],
+                [laid for each in cuts[stream] if len(laid := each.laid(index))],
+                [each.singles(index) for each in cuts[stream]],
                 decoder,
             )
             for stream in (Stream.DVL, Stream.REFERENCE, Stream.IMU)
@@ -94,8 +94,8 @@ class _Cut:
 
     def newest_ns(self, index: int) -> int:
         """Return the log time of the last message up to the end of this stretch; 0 without any."""
-        both = (self._part.laid, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
-        return max(int(each.log_ns[end - 1]) if end else 0 for each, end in both)
+        ends = (self._part.laid, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
+        return max(int(each.log_ns[end - 1]) if end else 0 for each, end in ends)
 
 
 def _block(
@@ -182,9 +182,9 @@ def _turned(axes: Axes, values: Array, covariances: Covariances, which: Mask) ->
     if which.all():
         return axes.velocity(values), Covariances(rotated, covariances.index)
     n = len(covariances.distinct)
-    both = np.concatenate([covariances.distinct, rotated])
+    distinct = np.concatenate([covariances.distinct, rotated])
     index = np.where(which & (covariances.index >= 0), covariances.index + n, covariances.index)
-    return np.where(which[:, None], axes.velocity(values), values), Covariances(both, index.astype(np.intp))
+    return np.where(which[:, None], axes.velocity(values), values), Covariances(distinct, index.astype(np.intp))
 
 
 def _imu(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:

@@ -68,15 +68,15 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
         for code in np.flatnonzero(np.bincount(part.laid.broken)).tolist():
             if code:
                 refused[rules[code - 1].counter] += int(np.count_nonzero(part.laid.broken == code))
-    singly = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
+    single_rows = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
     rows: list[_Row] = []
     position = VELOCITY_TYPES[msgtype].position if msgtype in VELOCITY_TYPES else None
-    window_s = 0.0 if position is None else _window_s(singly, parameters)
+    window_s = 0.0 if position is None else _window_s(single_rows, parameters)
     if position is not None:
-        rows = _differences(singly, position, window_s)
-        unread = [why for _, _, message, why in singly if message is None]
+        rows = _differences(single_rows, position, window_s)
+        unread = [why for _, _, message, why in single_rows if message is None]
     else:
-        for arrival, log_ns, message, why in singly:
+        for arrival, log_ns, message, why in single_rows:
             try:
                 row, broken = _row(arrival, log_ns, message, msgtype, parameters)
             except UNREADABLE as error:
@@ -94,9 +94,9 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
         columns.append(_of_rows(rows, width, is_imu))
     _, log_ns, stamps_ns, values, variances, unmeasured = columns[0] if len(columns) == 1 else _in_order(columns)
     values, variances = _plausible(values, FASTEST), _plausible(variances, FASTEST**2)
-    because = unread[0] if unread else ""
+    first_reason = unread[0] if unread else ""
     return Recorded(
-        topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, len(unread), window_s, because
+        topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, len(unread), window_s, first_reason
     )
 
 
@@ -121,12 +121,12 @@ def _plausible(values: Array, most: float) -> Array:
 
 def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Parameters) -> tuple[_Row, list[str]]:
     """Convert a message; return it with the counters of the rules that refuse it. Raises `UNREADABLE`."""
-    at_ns = stamp_ns(message.header.stamp)
+    stamp = stamp_ns(message.header.stamp)
     if msgtype == IMU_TYPE:
-        q = message.orientation
+        orientation = message.orientation
         given = message.orientation_covariance[0] != NO_DATA
-        values = (q.x, q.y, q.z, q.w) if given else (np.nan,) * 4
-        return _Row(arrival, log_ns, at_ns, values, np.full(3, np.nan)), []
+        values = (orientation.x, orientation.y, orientation.z, orientation.w) if given else (np.nan,) * 4
+        return _Row(arrival, log_ns, stamp, values, np.full(3, np.nan)), []
     kind = VELOCITY_TYPES[msgtype]
     v = kind.velocity(message)
     variances = np.full(3, np.nan)
@@ -137,7 +137,7 @@ def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Para
         if not (flat[[0, step, 2 * step]] <= 0.0).any():
             variances = flat[[0, step, 2 * step]]
     broken = kind.broken_rule(message, parameters)
-    return _Row(arrival, log_ns, at_ns, (v.x, v.y, v.z), variances), [] if broken is None else [broken.counter]
+    return _Row(arrival, log_ns, stamp, (v.x, v.y, v.z), variances), [] if broken is None else [broken.counter]
 
 
 def _window_s(singly: Sequence[tuple[int, int, Any, str]], parameters: Parameters) -> float:
@@ -166,7 +166,7 @@ def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType
 
 def _of_rows(rows: Sequence[_Row], width: int, is_imu: bool) -> tuple[Any, ...]:
     """Convert decoded rows to columns: arrival, log time and stamp (N,), values (N, width), variances (N, 3)."""
-    times = (np.array([row[place] for row in rows], dtype=np.int64) for place in range(3))
+    times = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
     values = np.array([row.values for row in rows], dtype=float).reshape(-1, width)
     if is_imu:
         return (*times, values, *NOTHING)

@@ -116,22 +116,22 @@ def look_of(
     every_s = seconds / count if count else 0.0
     is_seldom = every_s > SELDOM_S and is_position(msgtype)
     numbers = _Numbers(msgtype, every_s if is_seldom else 1.0)
-    taken = np.zeros(0, dtype=np.int64) if whole or is_seldom else in_bursts(parts, spans_ns)
-    if not len(taken):  # bursts may miss all messages if one wrong log time makes the recording long
-        taken = np.sort(np.concatenate([part.arrivals[0] for part in parts]))
+    chosen = np.zeros(0, dtype=np.int64) if whole or is_seldom else in_bursts(parts, spans_ns)
+    if not len(chosen):  # bursts may miss all messages if one wrong log time makes the recording long
+        chosen = np.sort(np.concatenate([part.arrivals[0] for part in parts]))
         if not is_position(msgtype):  # positions are kept, because velocities are differences of successive ones
-            taken = taken[:: -(-len(taken) // MOST) or 1]
+            chosen = chosen[:: -(-len(chosen) // MOST) or 1]
     for part in parts:
-        numbers.add_columns(part, _places(part.laid.arrival, taken))
-    singly = sorted(
-        (row for part in parts for row in part.singles.messages(_places(part.singles.arrival, taken))),
+        numbers.add_columns(part, _places(part.laid.arrival, chosen))
+    singles = sorted(
+        (row for part in parts for row in part.singles.messages(_places(part.singles.arrival, chosen))),
         key=lambda row: row[0],
     )
-    numbers.add_messages([(arrival, log_ns, message) for arrival, log_ns, message, _ in singly if message is not None])
-    found = numbers.in_order()
-    if found is None:
+    numbers.add_messages([(arrival, log_ns, message) for arrival, log_ns, message, _ in singles if message is not None])
+    ordered = numbers.in_order()
+    if ordered is None:
         return None
-    stamps_ns, log_ns, values, extra, kept = found
+    stamps_ns, log_ns, values, extra, kept = ordered
     clock_rate = _clock_rate(stamps_ns, log_ns)
     ahead_s = 1e-9 * float(median(stamps_ns - start_ns - clock_rate * (log_ns - start_ns)))
     stamps_s = 1e-9 * (stamps_ns[kept] - start_ns)
@@ -139,10 +139,10 @@ def look_of(
     rates, pose = extra[kept, :3], extra[kept, 3:] if msgtype == ODOMETRY else None
     if msgtype == IMU_TYPE:
         values, rates = np.hstack([values, extra]), np.full((0, 3), np.nan)
-    turns = None if np.isnan(rates).all() else rates
+    known_rates = None if np.isnan(rates).all() else rates
     frame_id, claimed = numbers.frame_id, numbers.claimed_std
     return Look(
-        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world, claimed,
+        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], known_rates, numbers.world, claimed,
         clock_rate, pose,
     )  # fmt: skip
 
@@ -159,12 +159,12 @@ def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
     return rates[-1] if min(abs(math.log(rate)) for rate in rates) > SIMULATED_TIME else 1.0
 
 
-def _places(arrival: Stamps, taken: Stamps) -> Index:
+def _places(arrival: Stamps, chosen: Stamps) -> Index:
     """Return the indices of rows, in order of arrival, that are among those taken."""
-    if not len(arrival) or not len(taken):
+    if not len(arrival) or not len(chosen):
         return np.zeros(0, dtype=np.intp)
-    at = np.minimum(np.searchsorted(arrival, taken), len(arrival) - 1)
-    return np.asarray(at[arrival[at] == taken])
+    matching = np.minimum(np.searchsorted(arrival, chosen), len(arrival) - 1)
+    return np.asarray(matching[arrival[matching] == chosen])
 
 
 def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]) -> Stamps:
@@ -172,27 +172,27 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
 
     spans_ns: start and end of each recorded stretch, in order.
     """
-    both = [part.arrivals for part in parts]
-    arrival, log_ns = (np.concatenate(each) for each in zip(*both, strict=True))
+    arrivals = [part.arrivals for part in parts]
+    arrival, log_ns = (np.concatenate(each) for each in zip(*arrivals, strict=True))
     if len(parts) > 1:
         order = np.argsort(arrival, kind="stable")
         arrival, log_ns = arrival[order], log_ns[order]
     starts_ns = [start_ns for start_ns, _ in spans_ns]
     recorded_before_ns = [0, *accumulate(end_ns - start_ns for start_ns, end_ns in spans_ns)]
     period_ns = max(recorded_before_ns[-1] // BURSTS, BURST_NS)
-    taken = []
-    at = 0
-    while at < len(log_ns):
-        now_ns = int(log_ns[at])
+    chosen = []
+    index = 0
+    while index < len(log_ns):
+        now_ns = int(log_ns[index])
         span = max(bisect_right(starts_ns, now_ns) - 1, 0)
         since_ns = (now_ns - starts_ns[span] + recorded_before_ns[span]) % period_ns
         if since_ns < BURST_NS:
-            taken.append(at)
+            chosen.append(index)
             next_ns = now_ns + BURST_EVERY_NS
         else:
             next_ns = now_ns + period_ns - since_ns
-        at = max(at + 1, int(log_ns.searchsorted(next_ns)))
-    return arrival[taken]
+        index = max(index + 1, int(log_ns.searchsorted(next_ns)))
+    return arrival[chosen]
 
 
 def is_position(msgtype: str) -> bool:

@@ -72,17 +72,17 @@ def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> Stream
     order = np.argsort(reference.stamps_ns, kind="stable")
     zero = zeros_while_moving(dvl, reference.part(order)) & ~refused
     finite = np.isfinite(dvl.values).all(axis=1)
-    sound = np.flatnonzero(~refused & ~zero & finite)
+    valid = np.flatnonzero(~refused & ~zero & finite)
     stamps = np.sort(dvl.stamps_ns[~refused])
     steps = 1e-9 * np.diff(stamps)
     steps = steps[steps > 0.0]
     interval = float(np.median(steps)) if len(steps) else np.nan
     gaps = steps[steps > DROPOUT_INTERVALS * interval] if len(steps) else steps
-    latency = 1e-9 * (log_ns - dvl.stamps_ns)[sound] if len(log_ns) == len(dvl) else np.zeros(0)
+    latency = 1e-9 * (log_ns - dvl.stamps_ns)[valid] if len(log_ns) == len(dvl) else np.zeros(0)
     if len(latency) and abs(float(np.median(latency))) > OTHER_CLOCK_S:
         latency = np.zeros(0)
-    values = dvl.values[sound]
-    between = int(np.rint(gaps / interval - 1.0).sum()) if len(gaps) else 0
+    values = dvl.values[valid]
+    n_in_gaps = int(np.rint(gaps / interval - 1.0).sum()) if len(gaps) else 0
     return StreamFacts(
         steps=steps,
         latency=latency,
@@ -91,7 +91,7 @@ def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> Stream
         missing=len(gaps) if not refused.any() else 0,
         refused=_runs(refused),
         zero=_runs(zero),
-        lost=max(between, int(refused.sum())) + int(zero.sum()),
+        lost=max(n_in_gaps, int(refused.sum())) + int(zero.sum()),
         repeats=int((np.diff(values, axis=0) == 0.0).all(axis=1).sum()),
     )
 
@@ -149,8 +149,8 @@ def read_log(
     loaded = load_recordings(source.opened, source.parameters, source.topics)
     facts = tuple(stream_facts(each, source.parameters, source.topics) for each in source.opened.each)
     on_progress(0.5)
-    exact = all(float(np.linalg.norm(one.dvl.roughness)) < NOISE_FREE_MPS for one in loaded.recordings)
-    recordings = tuple(dithered(one) for one in loaded.recordings) if exact else loaded.recordings
+    exact = all(float(np.linalg.norm(each.dvl.roughness)) < NOISE_FREE_MPS for each in loaded.recordings)
+    recordings = tuple(dithered(each) for each in loaded.recordings) if exact else loaded.recordings
     diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, effects, with_series)
     on_progress(1.0)
     residuals: tuple[Array, ...] = ()

@@ -96,34 +96,34 @@ def scatter(log: Log) -> list[Scatter]:
     if log.selection is None:
         return []
     problem, hypothesis = log.selection.fitter.problem, log.selection.fit.hypothesis
-    found = []
+    scatters = []
     for index, (recording, residual) in enumerate(zip(log.recordings, log.residuals, strict=True)):
         dvl = recording.dvl
         if dvl.interval <= FAST_ENOUGH_S:
-            values, inner, norm_of = _differences(dvl.time, dvl.values, dvl.interval, (1.0, -4.0, 6.0, -4.0, 1.0))
+            values, middle, white_norm = _differences(dvl.time, dvl.values, dvl.interval, (1.0, -4.0, 6.0, -4.0, 1.0))
             of_reference, thin = 0.0, 5
         else:
-            values, inner, norm_of = _differences(dvl.time, residual, dvl.interval, (1.0, -2.0, 1.0))
+            values, middle, white_norm = _differences(dvl.time, residual, dvl.interval, (1.0, -2.0, 1.0))
             of_reference, thin = float(np.mean(recording.reference.noise)), 3
         if len(values) < FEWEST_BLOCKS * BLOCK:
             continue
-        motion = problem.seen(hypothesis, index, dvl.time[inner]).motion
-        found.append(Scatter(values / norm_of, motion, thin, of_reference))
-    return found
+        motion = problem.seen(hypothesis, index, dvl.time[middle]).motion
+        scatters.append(Scatter(values / white_norm, motion, thin, of_reference))
+    return scatters
 
 
 def _differences(
     time: Array, values: Array, interval: float, weights: Sequence[float]
 ) -> tuple[Array, NDArray[np.intp], float]:
-    """Return differences (K, 3) of neighbours without a gap, their middle samples, and their norm for white noise."""
-    w, reach = np.array(weights), len(weights) // 2
-    n = len(time) - 2 * reach
+    """Return gapless weighted sums (K, 3) of consecutive samples, their middle indices, and the gain of white noise."""
+    w, n_aside = np.array(weights), len(weights) // 2
+    n = len(time) - 2 * n_aside
     if n < 1:
         return np.zeros((0, values.shape[1])), np.zeros(0, dtype=np.intp), 1.0
-    inner = np.arange(reach, reach + n)
-    sums = np.sum([each * values[k : k + n] for k, each in enumerate(w)], axis=0)
-    adjacent = np.abs(time[2 * reach :] - time[:n] - 2 * reach * interval) < 0.5 * interval
-    return sums[adjacent], inner[adjacent], float(np.sqrt(w @ w))
+    middle = np.arange(n_aside, n_aside + n)
+    sums = np.sum([weight * values[shift : shift + n] for shift, weight in enumerate(w)], axis=0)
+    adjacent = np.abs(time[2 * n_aside :] - time[:n] - 2 * n_aside * interval) < 0.5 * interval
+    return sums[adjacent], middle[adjacent], float(np.sqrt(w @ w))
 
 
 def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:
@@ -171,8 +171,8 @@ def levels_by_regime(log: Log) -> dict[str, float]:
         def __init__(self, motion: EffectInput) -> None:
             self.motion = motion
 
-    seen = [_AtSamples(each.motion) for each in scattered]
-    masks = {"all": np.ones(len(values), dtype=bool)} | regimes(problem, seen, per_sample=True)  # type: ignore[arg-type]
+    motions = [_AtSamples(each.motion) for each in scattered]
+    masks = {"all": np.ones(len(values), dtype=bool)} | regimes(problem, motions, per_sample=True)  # type: ignore[arg-type]
     return {
         name: float(np.linalg.norm(robust_std(values[mask])))
         for name, mask in masks.items()
@@ -190,15 +190,15 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
     for name, unit in units.items():
         if not all(name in each for each in slopes):
             continue
-        (a, std_a), (b, std_b) = (each[name] for each in slopes)
+        (vehicle_slope, vehicle_std), (simulator_slope, simulator_std) = (each[name] for each in slopes)
         is_present = tuple(_is_significant(each, name) for each in slopes)
-        p = float(2.0 * norm.sf(abs(a - b) / np.hypot(std_a, std_b)))
+        p = float(2.0 * norm.sf(abs(vehicle_slope - simulator_slope) / np.hypot(vehicle_std, simulator_std)))
         found.append(
             Candidate(
                 f"growth_with_{name}",
                 unit,
-                around(a, std_a),
-                around(b, std_b),
+                around(vehicle_slope, vehicle_std),
+                around(simulator_slope, simulator_std),
                 p,
                 (is_present[0], is_present[1]),
                 matters=any(is_present),
@@ -241,25 +241,25 @@ def _covariates(scattered: Scatter) -> dict[str, Array]:
 
 def slopes_of(scattered: Sequence[Scatter]) -> Slopes:
     """Fit slope and standard deviation by covariate to log squares, with the scatter of blocks (sandwich estimate)."""
-    each = [_covariates(one) for one in scattered]
-    names = [name for name in SPREAD if all(name in one for one in each)]
-    columns = {name: np.concatenate([one[name] for one in each]) for name in names}
+    covariates = [_covariates(side) for side in scattered]
+    names = [name for name in SPREAD if all(name in side for side in covariates)]
+    columns = {name: np.concatenate([side[name] for side in covariates]) for name in names}
     if np.mean(columns["astern"] > ASTERN_MPS) <= ASTERN_SHARE:
         del columns["astern"]
     columns = {name: column for name, column in columns.items() if np.std(column) > SPREAD[name]}
     if not columns:
         return {}
-    values = np.concatenate([each.values for each in scattered])
+    values = np.concatenate([covariates.values for covariates in scattered])
     scale = robust_std(values)
     log_square = np.log(np.maximum(((values / scale) ** 2).mean(axis=1), 1e-12))
-    x = np.column_stack([np.ones(len(values)), *(column - column.mean() for column in columns.values())])
-    inverse = np.linalg.pinv(x.T @ x)
-    parameters = inverse @ x.T @ log_square
-    block = np.arange(len(x)) // BLOCK
-    sample_scores = (log_square - x @ parameters)[:, None] * x
+    design = np.column_stack([np.ones(len(values)), *(column - column.mean() for column in columns.values())])
+    inverse = np.linalg.pinv(design.T @ design)
+    parameters = inverse @ design.T @ log_square
+    block = np.arange(len(design)) // BLOCK
+    sample_scores = (log_square - design @ parameters)[:, None] * design
     scores = np.stack([np.bincount(block, column) for column in sample_scores.T], axis=1)
     n = len(scores)
-    covariance = inverse @ (scores.T @ scores) @ inverse * n / max(n - x.shape[1], 1)
+    covariance = inverse @ (scores.T @ scores) @ inverse * n / max(n - design.shape[1], 1)
     std = np.sqrt(np.diag(covariance))
     return {name: (0.5 * float(parameters[i]), 0.5 * float(std[i])) for i, name in enumerate(columns, start=1)}
 
@@ -365,9 +365,9 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
     noise = [_noise(each, float(adjusted)) for each, adjusted in zip(candidates, p[len(compared.p) :], strict=True)]
     noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
     status = {each.name: each.status for each in found}
-    both = {name: (*compared.sizes[name], status[name]) for name in compared.p}
+    compared_sizes = {name: (*compared.sizes[name], status[name]) for name in compared.p}
     own_effects = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
-    shrunk = shrink(vehicle, simulator, models(both, own_effects))
+    shrunk = shrink(vehicle, simulator, models(compared_sizes, own_effects))
     levels = [levels_by_regime(log) for log in (vehicle, simulator)]
     verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
     return UnpairedComparison(

@@ -77,12 +77,12 @@ class Size:
         """Return 95 per cent intervals by name, and by recording if they differ."""
         # the covariance is estimated from this number of blocks, which also determine the calibration
         dof = max(self.dof - CALIBRATION - len(self.covariance), FEWEST_DOF)
-        reach = t.ppf(0.975, dof) * np.sqrt(np.diag(self.covariance))
-        whose = [f" of {name}" for name in self.recordings] or [""]
-        names = [f"{name}{of}" for of in whose for name in self.names]
+        half_width = t.ppf(0.975, dof) * np.sqrt(np.diag(self.covariance))
+        suffixes = [f" of {name}" for name in self.recordings] or [""]
+        names = [f"{name}{suffix}" for suffix in suffixes for name in self.names]
         return {
-            name: (float(v), float(v - w), float(v + w))
-            for name, v, w in zip(names, self.stacked.ravel(), reach, strict=True)
+            name: (float(value), float(value - half), float(value + half))
+            for name, value, half in zip(names, self.stacked.ravel(), half_width, strict=True)
         }
 
     def p_absent(self) -> float:
@@ -97,8 +97,8 @@ def compared_names(vehicle: Size, simulator: Size) -> list[str]:
     A side without the second occurrence has 0 for it.
     """
     own = [*dict.fromkeys([*vehicle.names, *simulator.names])]
-    again = vehicle.effect.again if vehicle.found and simulator.found else ()
-    return [name for name in own if name in again or (name in vehicle.names and name in simulator.names)]
+    second_occurrence = vehicle.effect.again if vehicle.found and simulator.found else ()
+    return [name for name in own if name in second_occurrence or (name in vehicle.names and name in simulator.names)]
 
 
 def p_alike(vehicle: Size, simulator: Size) -> float:
@@ -142,22 +142,22 @@ def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str
     """
     equals = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
     names: list[dict[str, str]] = [{name: name for name in side} for side in equals]
-    for one, other_side in ((0, 1), (1, 0)):
-        for name, equivalent in equals[one].items():
-            if name in equals[other_side] or names[one][name] != name:
+    for own, other_side in ((0, 1), (1, 0)):
+        for name, equivalent in equals[own].items():
+            if name in equals[other_side] or names[own][name] != name:
                 continue
-            shared = [other for other in equivalent if other in equals[other_side] and other not in equals[one]]
+            shared = [other for other in equivalent if other in equals[other_side] and other not in equals[own]]
             if shared:
-                names[one][name] = shared[0]
+                names[own][name] = shared[0]
     return names[0], names[1]
 
 
 def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]:
     """Return the names to compare. Of three clocks only two differences are observable, so the third is omitted."""
-    both = {*vehicle.values(), *simulator.values()}
-    if set(CLOCKS) <= both:
-        both.discard(ATTITUDE_CLOCK)
-    return [name for name in EFFECTS if name in both] + sorted(both - set(EFFECTS))
+    names = {*vehicle.values(), *simulator.values()}
+    if set(CLOCKS) <= names:
+        names.discard(ATTITUDE_CLOCK)
+    return [name for name in EFFECTS if name in names] + sorted(names - set(EFFECTS))
 
 
 def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
@@ -178,17 +178,17 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
     covariance = fit.covariance(block)
     dof = int(block.max()) + 1
     vector = fit.hypothesis.vector()
-    n = len(fit.seen)
-    result, at = {}, 6
+    n_all = len(fit.seen)
+    result, first = {}, 6
     for effect in fit.effects:
-        whose = whose_parameters(effect, n)
-        p, r = len(amplitudes(effect)), len(whose)
-        part = slice(at, at + p * r)
-        at += p * r
-        if not p:  # no part is observable
+        owners = whose_parameters(effect, n_all)
+        n_parameters, n_recordings = len(amplitudes(effect)), len(owners)
+        part = slice(first, first + n_parameters * n_recordings)
+        first += n_parameters * n_recordings
+        if not n_parameters:  # no part is observable
             continue
-        stacked = vector[part].reshape(r, p)
-        recordings = tuple(selection.fitter.problem.recordings[i].name for i in whose if i is not None)
+        stacked = vector[part].reshape(n_recordings, n_parameters)
+        recordings = tuple(selection.fitter.problem.recordings[i].name for i in owners if i is not None)
         result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found, recordings)
     return result
 
@@ -209,10 +209,10 @@ def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
     axis = int(np.argmax(energy.sum(axis=0)))
     regime, share, densest = "all", 1.0, DENSER
     for name, mask in regimes(problem, fit.seen).items():
-        within = float(energy[mask].sum()) / total
-        density = within / float(mask.mean())
-        if within > MOST and density > densest:
-            regime, share, densest = name, within, density
+        regime_share = float(energy[mask].sum()) / total
+        density = regime_share / float(mask.mean())
+        if regime_share > MOST and density > densest:
+            regime, share, densest = name, regime_share, density
     nyquist = 0.5 / problem.interval
     power = (np.abs(np.fft.rfft(trace, axis=0)) ** 2).sum(axis=1)
     frequency = np.linspace(0.0, nyquist, len(power))

@@ -50,7 +50,10 @@ class SimulatedModel:
 
 
 def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Sequence[Effect]) -> list[SimulatedModel]:
-    """Return the ladder of models. sizes: of both sides by name, and their comparison. vehicle: its effects."""
+    """Return the simulator as it is, with each lacking effect alone, with all, and with the vehicle's noise.
+
+    sizes: of each effect on vehicle and simulator, and how they compare. vehicle: its effects.
+    """
     kept = {
         name: (simulator.effect, _values(simulator))
         for name, (_, simulator, status) in sizes.items()
@@ -104,37 +107,38 @@ class Shrunk:
 
 
 def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed: int = 0) -> Shrunk:
-    """Evaluate the ladder on the vehicle's recordings."""
+    """Compare the vehicle's DVL with the velocity that each model of the ladder predicts. seed: of random noise."""
     selection = vehicle.selection
     if selection is None:
         raise ValueError("nothing was fitted to the vehicle's recordings")
     rng = np.random.default_rng(seed)
     problem = selection.fitter.problem
-    truth = [each.dvl.values for each in problem.recordings]
+    recorded = [each.dvl.values for each in problem.recordings]
     time = np.concatenate([each.dvl.time for each in problem.recordings])
-    recording_of = np.repeat(np.arange(len(truth), dtype=np.intp), [len(each) for each in truth])
-    windows = np.floor(time / WINDOW_S).astype(int) + recording_of * 1_000_000
-    everything = _held_out(selection, ladder[-1])
+    recording_of = np.repeat(np.arange(len(recorded), dtype=np.intp), [len(each) for each in recorded])
+    windows: Array = np.floor(time / WINDOW_S) + 1e6 * recording_of
+    full = _held_out(selection, ladder[-1])
     # a time shift or lag changes the reference's noise, which must not be counted twice
     shifts = tuple(each for each in ladder[-1].added if _is_time_shift(each))
     ideal = _held_out(selection, SimulatedModel("", shifts, {}))
     # the vehicle's residual includes its reference's noise; the simulator's reference is noise-free
     of_reference = _reference_noise(problem, selection.fit.hypothesis, rng)
-    drawn = [_random_noise(simulator.residuals, a, rng) + b[0] for a, b in zip(truth, of_reference, strict=True)]
+    drawn = [_random_noise(simulator.residuals, dvl, rng) + r[0] for dvl, r in zip(recorded, of_reference, strict=True)]
     own_noise = [
-        turned_over(a - b, noise_spectrum(of_it, one.dvl.noise), rng)
-        for a, b, of_it, one in zip(truth, everything, of_reference, problem.recordings, strict=True)
+        turned_over(dvl - predicted, noise_spectrum(of_it, one.dvl.noise), rng)
+        for dvl, predicted, of_it, one in zip(recorded, full, of_reference, problem.recordings, strict=True)
     ]
-    recorded = np.concatenate([a - b for a, b in zip(truth, ideal, strict=True)])
+    all_recorded, all_ideal = np.concatenate(recorded), np.concatenate(ideal)
+    recorded_errors = all_recorded - all_ideal
     rungs, errors = [], {}
     for model in ladder:
         is_everything = set(model.added) == set(ladder[-1].added) and not model.kept
-        predicted = everything if is_everything else _held_out(selection, model)
-        difference = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
-        noise = own_noise if model.vehicle_noise else drawn
-        simulated = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
+        predicted = full if is_everything else _held_out(selection, model)
+        all_predicted = np.concatenate(predicted)
+        difference = all_recorded - all_predicted
+        simulated = all_predicted - all_ideal + np.concatenate(own_noise if model.vehicle_noise else drawn)
         known = np.isfinite(difference).all(axis=1)
-        distance, null95, p = two_samples(recorded[known], simulated[known], windows[known], rng)
+        distance, null95, p = two_samples(recorded_errors[known], simulated[known], windows[known], rng)
         errors[model.name] = difference
         rungs.append(Rung(model.name, _rms(difference[known]), distance, null95, p))
     gap = vehicle.diagnosis.gap
@@ -181,9 +185,9 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
 def _fold_of(problem: Problem, recording: int) -> Array:
     """Return the fold (N,) of each DVL sample of a recording: stretches of time in turn; -1 outside the fit."""
     time = problem.recordings[recording].dvl.time - problem.grids[recording].delay_s
-    of = problem.grids[recording].bin_time
+    bin_times = problem.grids[recording].bin_time
     fold = stretch_of(time) % SETTINGS.folds
-    inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)
+    inside = (time >= bin_times[0]) & (time <= bin_times[-1]) if len(bin_times) else np.zeros(len(time), dtype=bool)
     return np.where(inside, fold, -1)
 
 
@@ -261,18 +265,18 @@ def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generat
     """Return the energy distance of two series' windows (N, 3), its 95 per cent quantile if both are alike, and p."""
     a, b = features(one, windows), features(other, windows)
     scale = np.maximum(robust_std(np.concatenate([a, b])), 1e-9)
-    both = np.concatenate([a, b]) / scale
-    distances = np.linalg.norm(both[:, None] - both[None], axis=2)
-    w = len(a)
-    if w < 4:
+    pooled = np.concatenate([a, b]) / scale
+    distances = np.linalg.norm(pooled[:, None] - pooled[None], axis=2)
+    n_windows = len(a)
+    if n_windows < 4:
         return np.nan, np.nan, np.nan
-    sign = np.concatenate([np.ones(w), -np.ones(w)])
+    sign = np.concatenate([np.ones(n_windows), -np.ones(n_windows)])
 
     def energy(signs: Array) -> Array:
         """Return -s'Ds / w², which is 2 E|X-Y| - E|X-X'| - E|Y-Y'|."""
-        return -np.einsum("...i,ij,...j->...", signs, distances, signs) / w**2
+        return -np.einsum("...i,ij,...j->...", signs, distances, signs) / n_windows**2
 
-    swap = rng.choice([-1.0, 1.0], (PERMUTATIONS, w))
+    swap = rng.choice([-1.0, 1.0], (PERMUTATIONS, n_windows))
     null = energy(np.concatenate([swap, -swap], axis=1))
     value = float(energy(sign))
     p = (1.0 + np.count_nonzero(null >= value)) / (1.0 + PERMUTATIONS)

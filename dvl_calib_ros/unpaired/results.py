@@ -175,7 +175,7 @@ def _row(compared: ComparedEffect | ComparedNoise | Rung | Lies, **renamed: str)
 
 
 def _plain(value: Any) -> Any:
-    """Return plain data; a value with its interval by names."""
+    """Convert for JSON; a triple (value, low, high) becomes ``{"value": ..., "ci95": [low, high]}``."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, Lies):

@@ -179,9 +179,9 @@ def _latency(vehicle: Log, simulator: Log) -> Candidate | None:
     return _compare_times("latency", latency_of(vehicle), latency_of(simulator), LATENCY_S)
 
 
-def _blocks(values: Array, of: Callable[[Array], Array]) -> Array:
+def _blocks(values: Array, statistic: Callable[[Array], Array]) -> Array:
     blocks = values[: len(values) // BLOCK * BLOCK].reshape(-1, BLOCK)
-    return of(blocks) if len(blocks) else np.zeros(0)
+    return statistic(blocks) if len(blocks) else np.zeros(0)
 
 
 def _compare_times(name: str, vehicle: Array, simulator: Array, threshold_s: float) -> Candidate | None:

@@ -43,8 +43,8 @@ CONFIGURATIONS = on_page(
     ),
     reject(
         "DVL_SIDE_INVERTED",
-        "the DVL's y points the other way: in turns the speed ahead changes by {slope:.1f} ± {std:.1f} times what the "
-        "current in the sway predicts",
+        "the DVL's y points the other way: in turns the speed ahead shows {slope:.1f} ± {std:.1f} times the current "
+        "that y shows",
         means=(
             "Left-handed axes of the DVL, forward-right-down for forward-left-up, or a heading that counts the other "
             "way."
@@ -139,7 +139,7 @@ CONFIGURATIONS = on_page(
     # gravity; alone it rejects no calibration, as no calibration uses the acceleration
     accept(
         "GRAVITY_SIGN",
-        "{topic}: the IMU's acceleration at rest points down, as gravity with the other sign",
+        "{topic}: the IMU's acceleration at rest points down, so its sign is wrong",
         remedy="correct the IMU's driver",
     ),
     accept(
@@ -179,7 +179,7 @@ CONFIGURATIONS = on_page(
     ),
     reject(
         "CLOCK_LATE",
-        "{whose} stamps are {seconds:.2f} s {way} against the others, which agree",
+        "{whose} stamps are {seconds:.2f} s {way}; the other clocks agree",
         remedy="set {parameter} to {offset:g}",
     ),
     reject(

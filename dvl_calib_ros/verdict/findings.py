@@ -47,7 +47,7 @@ FINDINGS = (
     ),
     warning(
         "CLOCK_TAKEN_OFF",
-        "{clock}: subtracted ({parameter}: {value:g}); the calibration restarted with it",
+        "{clock}; this is now subtracted ({parameter}: {value:g}), and the calibration has restarted",
         remedy="correct that clock, or set this value as a parameter, which is then kept",
     ),
     warning(
@@ -89,13 +89,13 @@ FINDINGS = (
     ),
     warning(
         "SAMPLES_BEFORE_RESTART",
-        "{count} {stream} samples were from before the clock was set back or the bag looped; they are not used",
+        "{count} {stream} samples are from before the restart (clock set back, or bag looped); they are not used",
         remedy="nothing, unless clocks are set during a run",
     ),
     warning(
         "SAMPLES_LATE",
-        "{count} {stream} samples came after the DVL sample that they belong to had been used; they are not used",
-        remedy="raise max_latency, in proportion when a bag is played faster than recorded",
+        "{count} {stream} samples arrived too late for their DVL samples and are not used",
+        remedy="raise max_latency; for a bag that is played at ten times its speed, ten times as high",
     ),
     warning(
         "MODEL_RESTARTED",
@@ -124,19 +124,19 @@ FINDINGS = (
     ),
     warning(
         "TOPIC_OTHER_TYPE",
-        "{topic}: {name} publishes {type}, where {expected} is expected, and is not heard",
+        "{topic}: {name} publishes {type} instead of {expected}; its messages are not received",
         means="The warning names the parameter.",
         remedy="{remedy}",
     ),
     warning(
         "TOPIC_QOS",
-        "{topic}: the QoS of {name} is incompatible, it is not heard ({reason})",
+        "{topic}: the QoS of {name} is incompatible; its messages are not received ({reason})",
         means="The publisher offers less than the node asks for.",
         remedy="set the publisher's durability to volatile, its reliability to either",
     ),
     warning(
         "OUTPUT_QOS",
-        "{topic}: {name} asks for an incompatible QoS and does not hear it ({reason})",
+        "{topic}: {name} requests an incompatible QoS and receives nothing ({reason})",
         remedy="change the QoS of the subscriber",
     ),
     warning(
@@ -153,8 +153,8 @@ FINDINGS = (
     ),
     warning(
         "POSITION_UNKNOWN",
-        "publish_tf is set, but the position of the reference point in {base} is unknown, and so is the DVL's; no "
-        "transform is published",
+        "publish_tf is set, but no transform is published: the positions of reference point and DVL in {base} are "
+        "unknown",
         remedy=(
             "set reference_position, and dvl_position to from_reference; or publish the transform of the reference's "
             "frame"
@@ -268,14 +268,14 @@ FINDINGS = (
     ),
     warning(
         "BAG_NO_DEFINITION",
-        "the bag does not say how {type} is laid out (recorded before ROS 2 Iron?); it is read by the definitions "
-        "known here",
+        "the bag has no definition of {type} (recorded before ROS 2 Iron?); the definition built into this program is "
+        "used",
         remedy="if it cannot be decoded, run ros2 bag convert to MCAP where the package is installed",
     ),
     # motion and configuration
     warning(
         "NO_TURN_RATE",
-        "{count} samples have no angular velocity for max_turn_rate and are not used",
+        "{count} samples are not used: max_turn_rate is set, and they have no angular velocity",
         remedy="check the IMU topic, or set max_turn_rate to 0",
     ),
     warning(
@@ -286,8 +286,8 @@ FINDINGS = (
     warning("ALL_SLOW", "every sample is slower than min_speed, nothing is learnt", remedy="drive, at 1 m/s or more"),
     warning(
         "SAMPLES_GATED",
-        "{model}: {gated} of {given} samples are gated",
-        remedy="check mounting_rpy and the frames before you use it: does the vehicle drive ahead in the DVL's x?",
+        "{model}: the gate rejects {gated} of {given} samples",
+        remedy="check mounting_rpy and the frames: with them, does a vehicle that drives ahead have positive speed?",
     ),
     error(
         "CONFIGURATION_WRONG",
@@ -297,9 +297,9 @@ FINDINGS = (
     warning(
         "HEADING_DEVIATION",
         "the heading error changes with the heading: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
-        "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
+        "{least:+.1f}° at {least_at:.0f}°; that is {cost:.0f} m of drift per km",
         means="A compass deviates with the heading, a gyro drifts.",
-        remedy="{first}calibrate the compass, or average the deviation out on opposite headings and a box",
+        remedy="calibrate the compass{first}, or average the deviation out on opposite headings and a box",
     ),
     warning(
         "HEADING_DRIFTS",
@@ -316,15 +316,15 @@ FINDINGS = (
     ),
     warning(
         "TILT_NOT_FOLLOWED",
-        "the DVL's velocity does not follow the vehicle's {axis}: {share:.1f} ± {std:.1f} times the {axis} remains, "
+        "the DVL's velocity does not follow the vehicle's {axis}: {share:.1f} ± {std:.1f} times the {axis} is missing, "
         "which looks like {off:.1f}° of mounting",
         means="Factor 1: the driver levels the velocity. 2 or -2: wrong sign of an IMU angle or a DVL axis.",
         remedy="have the driver send the velocity in the DVL's own axes; check the sign of the IMU's roll and pitch",
     ),
     warning(
         "TILT_NOT_SHOWN",
-        "the vehicle hardly tilts, so nothing shows whether the DVL's driver levels its velocity: if it does, the "
-        "vehicle's mean {axis} is in the mounting ({lean:.1f}° of {axis})",
+        "the vehicle hardly tilts, so the data cannot show whether the DVL's driver levels its velocity; if it does, "
+        "the {axis} of the mounting is wrong by {lean:.1f}°",
         remedy="look into the driver's settings, or record in waves or with dives",
     ),
     warning(
@@ -342,8 +342,8 @@ FINDINGS = (
     ),
     warning(
         "BEAM_OFF",
-        "one beam of the DVL is off by {percent:.0f} ± {std:.0f} %: that at {azimuth:.0f}° from its x axis to port "
-        "reads low, or the opposite one high",
+        "one beam of the DVL is off by {percent:.0f} ± {std:.0f} %: the beam {azimuth:.0f}° to port of its x axis "
+        "reads low, or the opposite beam high",
         means="A fouled or damaged transducer, or bubbles before it; roll and yaw of the mounting are then wrong.",
         remedy="look at that transducer; a DVL that gives beam velocities can solve without it",
     ),
@@ -351,7 +351,7 @@ FINDINGS = (
         "BED_MOVES",
         "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
         "on every heading",
-        means="Bottom track follows moving sediment or the water's layer.",
+        means="The DVL tracks moving sediment or a layer of water.",
         remedy="calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
     ),
     warning(
@@ -362,7 +362,7 @@ FINDINGS = (
     ),
     warning(
         "CIRCULAR_REFERENCE",
-        "the reference follows the DVL's own noise for {seconds:.1f} s: a filter made it from this DVL",
+        "the reference holds the DVL's own noise of the last {seconds:.1f} s: a filter computed it from this DVL",
         remedy="use the velocity or positions of GNSS alone",
     ),
     warning(
@@ -371,7 +371,7 @@ FINDINGS = (
         means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
         remedy=(
             "measure the positions of DVL and reference point (lever_arm, reference_position), then check the IMU's "
-            "axes, clock"
+            "axes and clock"
         ),
     ),
     warning(
@@ -413,7 +413,7 @@ FINDINGS = (
     ),
     warning(
         "RESULT_WORSE",
-        "{path} is kept, which is better ({before}); the newer result ({now}) is {beside}",
+        "{path} is kept, because it is better ({before}); the newer result ({now}) is {beside}",
         remedy="to use the newer result anyway, rename its file, or call ~/save_anyway",
     ),
     warning(
@@ -436,7 +436,7 @@ DOCTOR = on_page(
     ),
     warning(
         "DOCTOR_STAMP_RECEPTION",
-        "{topic}: stamps jitter with the reception ({jitter_ms:.0f} ms about {period_ms:.0f} ms), not with the sensor",
+        "{topic}: stamps look like times of reception: they jitter by {jitter_ms:.0f} ms about {period_ms:.0f} ms",
         remedy="let the driver take the sensor's own time; then dvl-calib diagnose BAG estimates the remaining delay",
     ),
     warning(

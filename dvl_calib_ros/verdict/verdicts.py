@@ -34,15 +34,15 @@ VERDICTS = on_page(
     ),
     marginal(
         "DRIFT_OPEN",
-        "the calibration leaves {open:.0f} m of drift per km open (1σ), more than {limit:.0f}",
+        "with this calibration dead reckoning may still drift by {open:.0f} m per km (1σ), more than {limit:.0f}",
         means="Up to five times `target_drift` is accepted.",
         remedy="drive on: other headings, other speeds, turns to both sides",
     ),
     # estimated values
     reject(
         "MISALIGNMENT_LARGE",
-        "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
-        means="Seldom the bracket.",
+        "the misalignment is {degrees:.1f}°; from {limit:.1f}° on a calibration is rejected",
+        means="The bracket is seldom the cause.",
         remedy=(
             "check mounting_rpy, the frames and a compass's declination; if they are right, try "
             "-p mounting_rpy:=[{roll:.0f}deg,{pitch:.0f}deg,{yaw:.0f}deg]"
@@ -99,12 +99,12 @@ VERDICTS = on_page(
     # dead reckoning
     marginal(
         "DRIFT_NO_BETTER",
-        "on data held out dead reckoning gets no better: {after:.1f} m per km with it, {before:.1f} as mounted",
+        "on held-out data dead reckoning gets no better: {after:.1f} m per km calibrated, {before:.1f} as mounted",
         means="The velocity fits better, but a lasting error remains.",
     ),
     reject(
         "DRIFT_WORSE",
-        "on data held out dead reckoning drifts by {after:.1f} m per km with it, by {before:.1f} as mounted",
+        "on held-out data dead reckoning gets worse: {after:.1f} m per km calibrated, {before:.1f} as mounted",
         remedy="an effect is missing from the model (dvl-calib diagnose looks for it)",
     ),
     # clocks
@@ -121,8 +121,7 @@ VERDICTS = on_page(
         remedy="replay each by itself, and compare them",
     ),
     reject(
-        "BAGS_MOUNTING_DIFFERS",
-        "the mounting differs {moved} {between}: the average of all is the mounting of none",
+        "BAGS_MOUNTING_DIFFERS", "the mounting differs {moved} {between}, so the average is no recording's mounting"
     ),
     reject(
         "BAGS_DELAY_CHANGED",
@@ -237,12 +236,12 @@ COMPARISONS = on_page(
     marginal(
         "SCALE_CHANGED",
         "the scale has changed by {percent:+.2f} % ± {std:.2f} % {between}",
-        remedy="the speed of sound, or the DVL's settings",
+        remedy="check the speed of sound and the DVL's settings",
     ),
     marginal(
         "DELAY_CHANGED",
         "the DVL's stamps come {seconds:.2f} s ± {std:.2f} s {way} {between}",
-        remedy="a clock, not the mounting",
+        remedy="check the clocks; a delay says nothing about the mounting",
     ),
     marginal(
         "SCATTER_BESIDE_MOVES",
@@ -261,8 +260,8 @@ COMPARISONS = on_page(
     ),
     warning(
         "ARMS_DIFFER",
-        "{name} was calibrated with another lever arm than {other} {verb} ({arm} m); the wrong one turns its angles",
-        remedy="if that one is right, calibrate {name} again with -p lever_arm:=[{arm}]",
+        "{name} was calibrated with another lever arm than {other} {verb} ({arm} m); a wrong arm turns the angles",
+        remedy="if {arm} m is right, calibrate {name} again with -p lever_arm:=[{arm}]",
     ),
 )
 
@@ -329,10 +328,10 @@ UNPAIRED = on_page(
     reject("SIMULATOR_LACKS", "the simulator lacks {names}"),
     reject("SIMULATOR_OTHER_SIZE", "the simulator has {names} of another size"),
     reject("SIMULATOR_ALONE_HAS", "the simulator has {names}, which the vehicle lacks"),
-    marginal("SIMULATOR_FRAME", "its DVL is mounted {simulator}, the vehicle's {vehicle}"),
+    marginal("SIMULATOR_FRAME", "the simulator's DVL is mounted {simulator}, the vehicle's {vehicle}"),
     accept(
         "SIMULATOR_PUT_RIGHT",
-        "when corrected, its held-out error on the vehicle's motion falls from {before:.1f} to {after:.1f} mm/s",
+        "corrected, the simulator's held-out error on the vehicle's motion falls from {before:.1f} to {after:.1f} mm/s",
     ),
     accept(
         "SIMULATOR_ROUNDS",
@@ -357,7 +356,7 @@ UNPAIRED = on_page(
     ),
     marginal(
         "SIMULATOR_NOT_SHOWN",
-        "no difference in effects is observable in these recordings, but some that matter would not be, either",
+        "these recordings show no difference in effects, but cannot show some differences that matter",
     ),
     accept("SIMULATOR_ALIKE", "the simulator lacks no effect that is observable in these recordings"),
     marginal("SIMULATOR_NOISE", "the noise differs in {names}"),

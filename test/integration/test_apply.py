@@ -228,7 +228,7 @@ def test_applied_twice_is_applied_once_and_the_file_before_is_still_kept(tmp_pat
     assert apply(saved, "--urdf", urdf) == 0
     after = urdf.read_bytes()
     assert apply(saved, "--urdf", urdf) == 0
-    assert "is so already" in capsys.readouterr().out
+    assert "already up to date" in capsys.readouterr().out
     assert (urdf.read_bytes(), (tmp_path / "robot.urdf.bak").read_bytes()) == (after, before)
 
 
@@ -500,7 +500,7 @@ def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_
     assert np.linalg.norm(again.result.estimate.misalignment[1:]) < 0.003
     # once more changes nothing, and the way back leads to what was there
     assert apply(saved, "--params", parameters) == 0
-    assert "is so already" in capsys.readouterr().out
+    assert "already up to date" in capsys.readouterr().out
     assert apply("--rollback", "--params", parameters) == 0
     assert parameters.read_bytes() == before
 

@@ -131,7 +131,7 @@ def test_one_alone_twice_the_same_and_a_file_that_is_not_there_are_one_line(plac
     assert "named twice" in fail(capsys, "compare", a, a)
     (tmp_path / "copy.yaml").write_bytes(a.read_bytes())
     for other in (tmp_path / "copy.yaml", place / "a"):  # the bag that it is from
-        assert "are one calibration by two names" in fail(capsys, "compare", place / "b.yaml", a, other)
+        assert "are the same calibration" in fail(capsys, "compare", place / "b.yaml", a, other)
     with pytest.raises(dc.InputError, match="by two names"):
         dc.compare(a, tmp_path / "copy.yaml")
     assert "no such" in fail(capsys, "compare", a, tmp_path / "nothing.yaml")

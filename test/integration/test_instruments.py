@@ -208,7 +208,7 @@ def test_what_is_sent_is_read_back_and_is_sent_once(saved, capsys):
     assert "mounting_rotation_offset: 20 ->" in said and "set, and read back" in said
     again = WaterLinked(kept)  # the same line once more turns nothing twice
     assert send(saved, again) == 0 and again.ended() == kept
-    assert "is so already" in capsys.readouterr().out
+    assert "already up to date" in capsys.readouterr().out
 
 
 def test_nothing_is_sent_to_a_dvl_that_is_set_otherwise_in_a_dry_run_or_to_one_that_is_not_told(saved, capsys):
@@ -285,7 +285,7 @@ def test_a_connection_that_ends_after_the_dvl_may_have_been_set_is_said(saved, c
     assert "the DVL may be set or not; repeat the command" in error and kept != NOW
     again = WaterLinked(kept)  # which the same line then tells
     assert send(saved, again) == 0 and again.ended() == kept
-    assert "is so already" in capsys.readouterr().out
+    assert "already up to date" in capsys.readouterr().out
 
 
 def test_a_dry_run_shows_what_files_would_change_and_changes_none(saved, tmp_path, capsys):

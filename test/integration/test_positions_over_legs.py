@@ -133,7 +133,7 @@ def test_a_diagnosis_of_noisy_positions_says_what_to_do(usbl):
 
 
 def test_the_model_of_positions_is_refused_where_there_are_velocities():
-    with pytest.raises(ParameterError, match=r"goes by positions, and .*Twist.* holds velocities; name another"):
+    with pytest.raises(ParameterError, match=r"needs positions, but .*Twist.* holds velocities; name another"):
         Calibrator(Parameters(model=POSITIONS.name))
 
 

@@ -62,7 +62,7 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     said = " ".join(out.split())
     assert re.search(r"reject: Do not use this calibration. The mounting differs in yaw by \+?-?[23]\.\d\d° ± 0", said)
     assert "5 Hz" in said and "360 s of data" in said  # the nights are not counted
-    assert "(tuesday) and" in said and "(wednesday): the average of all" in said
+    assert "(tuesday) and" in said and "(wednesday), so the average" in said
     document = json.loads((tmp_path / "r.json").read_text())
     assert document["recordings"]["moved"][0]["first_after"] == "wednesday"
     assert document["verification"]["M3"]["verdict"] == "reject"

@@ -247,5 +247,5 @@ def test_topics_that_were_named_are_kept_and_none_is_looked_for_if_nobody_wants_
 def test_the_model_of_positions_is_refused_while_the_reference_is_velocities(world):
     with node_here(world) as node:
         (answer,) = node.set_parameters([Parameter("model", value=POSITIONS.name)])
-        assert not answer.successful and "goes by positions" in answer.reason
+        assert not answer.successful and "needs positions" in answer.reason
         assert node._calibrator.selected != POSITIONS.name

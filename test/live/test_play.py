@@ -167,7 +167,7 @@ def test_who_comes_late_hears_the_recorded_description_with_the_transforms_as_jo
         (["--clock", "1e6"], "--clock"),
         (["--topics", "/sonar"], "/sonar is not in the recording, which has dvl/twist, gnss/twist, imu/data"),
         (["--remap", "dvl/twist=x"], "'dvl/twist=x' is not OLD:=NEW"),
-        (["--remap", "dvl/twist:=2 x"], "topic '2 x' cannot be had"),
+        (["--remap", "dvl/twist:=2 x"], "topic '2 x' cannot be used"),
         (["--start-offset", "11"], "the recording has 1"),
         (["--delay", "-1"], "--delay"),
         (["--playback-duration", "0"], "--playback-duration"),

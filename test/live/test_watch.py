@@ -450,7 +450,7 @@ def test_q_does_not_replace_a_good_result_by_a_few_samples_without_asking(world,
         last = screen.rest().rstrip().splitlines()[-1]
         assert screen.process.wait(30) == 0
     assert saved.read_bytes() == good and (tmp_path / "result.newer.yaml").exists()
-    assert "is kept, which is better" in last
+    assert "is kept, because it is better" in last
 
 
 def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_running(world):

@@ -401,7 +401,7 @@ class _FileWalk:
         return self._resume_after(at).place if end is None else end
 
     def _resume_after(self, at: int) -> Resumed:
-        """Return where to continue after the damaged record at `at`."""
+        """Return where to continue after the damaged record at `at`: its own end, if sound, else the next found."""
         if self._before is None and not head_at(self._file, at).startswith(bytes([MESSAGE])):
             end = sound_end(self._file, at, self._size, self._tables)
             if end is not None:

@@ -351,20 +351,20 @@ def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) 
     return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
 
 
-def _definitions_between(records: bytes, here: int, end: int) -> list[tuple[int, bytes]] | None:
+def _definitions_between(records: bytes, start: int, end: int) -> list[tuple[int, bytes]] | None:
     """Return opcode and content of the schemas and channels between two positions; None if there is anything else."""
     found = []
-    while here + RECORD_HEAD.size <= end:
-        opcode, length = RECORD_HEAD.unpack_from(records, here)
-        if opcode not in (SCHEMA, CHANNEL) or here + RECORD_HEAD.size + length > end:
+    while start + RECORD_HEAD.size <= end:
+        opcode, length = RECORD_HEAD.unpack_from(records, start)
+        if opcode not in (SCHEMA, CHANNEL) or start + RECORD_HEAD.size + length > end:
             return None
-        found.append((opcode, records[here + RECORD_HEAD.size : here + RECORD_HEAD.size + length]))
-        here += RECORD_HEAD.size + length
-    return found if here == end else None
+        found.append((opcode, records[start + RECORD_HEAD.size : start + RECORD_HEAD.size + length]))
+        start += RECORD_HEAD.size + length
+    return found if start == end else None
 
 
 def messages_of(
-    at: int,
+    chunk_at: int,
     records: bytes,
     tables: Tables,
     damage: Damage,
@@ -377,35 +377,35 @@ def messages_of(
     """
     found: list[Found] = []
     n = len(records)
-    here, before, kept = 0, None, 0
-    while here < n:
+    position, previous, n_before_previous = 0, None, 0
+    while position < n:
         try:
-            if holes and any(first < here + 9 and here < last for first, last in holes):
-                raise DamagedError(f"at byte {at}: a record cannot be read from the disk")
-            opcode, length = RECORD_HEAD.unpack_from(records, here)
-            end = here + 9 + length
+            if holes and any(first < position + 9 and position < last for first, last in holes):
+                raise DamagedError(f"at byte {chunk_at}: a record cannot be read from the disk")
+            opcode, length = RECORD_HEAD.unpack_from(records, position)
+            end = position + 9 + length
             if end > n or not SCHEMA <= opcode <= MESSAGE:
-                raise DamagedError(f"in the chunk at byte {at}: a record is cut off or damaged")
-            head = records[here : here + MESSAGE_START]
+                raise DamagedError(f"in the chunk at byte {chunk_at}: a record is cut off or damaged")
+            head = records[position : position + MESSAGE_START]
             count = len(found)
-            if holes and any(first < end and here < last for first, last in holes):
-                damage.note(f"at byte {at}: a record cannot be read from the disk", end - here)
+            if holes and any(first < end and position < last for first, last in holes):
+                damage.note(f"at byte {chunk_at}: a record cannot be read from the disk", end - position)
             elif opcode == MESSAGE:
                 channel, log_ns = message_head(
-                    head, at, here, n, tables, lambda place: records[place : place + MESSAGE_START]
+                    head, chunk_at, position, n, tables, lambda start: records[start : start + MESSAGE_START]
                 )
                 if wanted is None or channel in wanted:
-                    found.append((log_ns, channel, records[here + MESSAGE_START : end]))
+                    found.append((log_ns, channel, records[position + MESSAGE_START : end]))
             else:
-                tables.note(at, opcode, records[here + 9 : end])
-            here, before, kept = end, here, count
+                tables.note(chunk_at, opcode, records[position + 9 : end])
+            position, previous, n_before_previous = end, position, count
         except (struct.error, DamagedError) as error:
-            place, is_before_damaged = resumed(BytesIO(records), before, here, n, tables)
-            if is_before_damaged and before is not None:
-                del found[kept:]
-                here = before
-            damage.note(str(error), place - here)
-            here, before = place, None
+            resume_at, is_before_damaged = resumed(BytesIO(records), previous, position, n, tables)
+            if is_before_damaged and previous is not None:
+                del found[n_before_previous:]
+                position = previous
+            damage.note(str(error), resume_at - position)
+            position, previous = resume_at, None
     found.sort(key=itemgetter(0))
     return found
 

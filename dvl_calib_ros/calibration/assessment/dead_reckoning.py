@@ -79,10 +79,10 @@ class SlowNoise(NamedTuple):
 
     def squares(self, seconds: Array, metres: Array) -> Array:
         """Return the mean square of the drift (K,) m² over stretches of these durations (K,) s and lengths (K,) m."""
-        passed = seconds / self.memory_s
-        spent = 2.0 * self.memory_s**2 * (passed - 1.0 + np.exp(-passed))
+        durations = seconds / self.memory_s
+        growth = 2.0 * self.memory_s**2 * (durations - 1.0 + np.exp(-durations))
         speed = metres / np.maximum(seconds, 1e-9)
-        return np.asarray((2.0 * self.velocity**2 + (self.heading * speed) ** 2) * spent)
+        return np.asarray((2.0 * self.velocity**2 + (self.heading * speed) ** 2) * growth)
 
 
 @dataclass(frozen=True)
@@ -162,42 +162,42 @@ def dead_reckoned(
     n = len(recording.dvl.times)
     before, after = _Level.of(n), _Level.of(n, whole=True)
     before.fill(recording, np.arange(n), NO_TERMS, parameters)
-    for k, each in enumerate(terms):
-        after.fill(recording, np.flatnonzero(folds == k), each, parameters)
+    for k, terms_of_fold in enumerate(terms):
+        after.fill(recording, np.flatnonzero(folds == k), terms_of_fold, parameters)
     known = np.isfinite(before.error[:, 0]) & np.isfinite(after.error[:, 0])
     on_a_map = bool(known.any() and (before.oriented & after.oriented)[known].all())
-    use = np.flatnonzero(known)
-    step_s = integration_steps(recording.dvl.times[use])
+    used = np.flatnonzero(known)
+    step_s = integration_steps(recording.dvl.times[used])
     axes = slice(2, 4) if on_a_map else slice(0, 2)
-    velocity = before.velocity[use, axes]
+    velocity = before.velocity[used, axes]
     distance = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
     if not len(distance) or distance[-1] < SHORTEST_M:
         return None
-    errors = [each.error[use, axes] for each in (before, after)]
-    astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
+    errors = [each.error[used, axes] for each in (before, after)]
+    track_errors = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
     if slow is not None and recording.reference.in_body.all():
         slow = slow._replace(heading=0.0)  # body velocities need no heading
     ends = ends_of_stretches(distance)
-    kept = np.round(np.linspace(0, len(use) - 1, min(MAP_POINTS, len(use)))).astype(np.intp)
+    kept = np.round(np.linspace(0, len(used) - 1, min(MAP_POINTS, len(used)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
         distance_m=float(distance[-1]),
         seconds=float(step_s.sum()),
         stretch_m=float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]]),
         stretches=len(ends) - 1,
-        before=drift_over(astray[0], distance, ends),
-        after=drift_over(astray[1], distance, ends),
+        before=drift_over(track_errors[0], distance, ends),
+        after=drift_over(track_errors[1], distance, ends),
         noise_per_km=_noise(errors[1], step_s, distance, ends, slow),
         on_a_map=on_a_map,
-        stamps_ns=np.round(recording.dvl.times[use[kept]] * 1e9).astype(np.int64) + epoch_ns,
+        stamps_ns=np.round(recording.dvl.times[used[kept]] * 1e9).astype(np.int64) + epoch_ns,
         distances=distance[kept],
         reference=reference[kept],
-        track_before=(reference - astray[0])[kept],
-        track_after=(reference - astray[1])[kept],
-        error_before=before.in_body[use[kept]],
-        error_after=after.in_body[use[kept]],
-        deviation=heading_deviation(after.yaw[use], heading) if on_a_map and heading is not None else None,
-        followed=_followed(recording, after, use, parameters) if on_a_map else None,
+        track_before=(reference - track_errors[0])[kept],
+        track_after=(reference - track_errors[1])[kept],
+        error_before=before.in_body[used[kept]],
+        error_after=after.in_body[used[kept]],
+        deviation=heading_deviation(after.yaw[used], heading) if on_a_map and heading is not None else None,
+        followed=_followed(recording, after, used, parameters) if on_a_map else None,
         beam=beam,
     )
 
@@ -224,21 +224,21 @@ class _Level(NamedTuple):
         kept = (np.empty((n, 3, 3)), np.empty((n, 3)), error, np.empty((n, 3))) if whole else ()
         return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
 
-    def fill(self, recording: ThinnedRecording, at: Index, terms: Terms, parameters: Parameters) -> None:
+    def fill(self, recording: ThinnedRecording, rows: Index, terms: Terms, parameters: Parameters) -> None:
         """Fill in some samples, corrected by these terms."""
         # intermediate arrays take twenty times the memory
-        for start in range(0, len(at), COMPARED_AT_ONCE):
-            some = at[start : start + COMPARED_AT_ONCE]
-            seen = recording.compared(some, terms, parameters)
-            self.oriented[some] = seen.oriented
-            rotation = seen.rotation_enu_from_body
-            self.yaw[some] = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-            self.in_body[some] = seen.error
-            for kept, own in zip(self.whole, (rotation, seen.body, seen.error, seen.rates), strict=False):
-                kept[some] = own
-            for level, body in ((self.velocity, seen.body), (self.error, seen.error)):
-                level[some, :2] = body[:, :2]
-                level[some, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]
+        for start in range(0, len(rows), COMPARED_AT_ONCE):
+            part = rows[start : start + COMPARED_AT_ONCE]
+            data = recording.compared(part, terms, parameters)
+            self.oriented[part] = data.oriented
+            rotation = data.rotation_enu_from_body
+            self.yaw[part] = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+            self.in_body[part] = data.error
+            for table, column in zip(self.whole, (rotation, data.body, data.error, data.rates), strict=False):
+                table[part] = column
+            for columns, body in ((self.velocity, data.body), (self.error, data.error)):
+                columns[part, :2] = body[:, :2]
+                columns[part, 2:] = np.matmul(data.rotation_enu_from_body, body[..., None])[:, :2, 0]
 
 
 def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Parameters) -> ResidualTrend | None:
@@ -255,8 +255,8 @@ def integration_steps(times: Array) -> Array:
     interval = np.diff(times, prepend=times[:1])
     if len(interval) < 2:
         return np.zeros(len(times))
-    usual = float(median(interval[1:]))
-    return np.where(interval > max(GAP_S, GAP_INTERVALS * usual), 0.0, np.maximum(interval, 0.0))
+    typical = float(median(interval[1:]))
+    return np.where(interval > max(GAP_S, GAP_INTERVALS * typical), 0.0, np.maximum(interval, 0.0))
 
 
 def ends_of_stretches(distance: Array) -> Index:
@@ -308,10 +308,10 @@ def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
     }
 
 
-def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Reason]:
+def objections(navigation: Navigation | None, predicted_drift: float = 0.0) -> list[Reason]:
     """Return the reasons against a calibration by its drift, which may grow although velocities fit better.
 
-    known_to: predicted drift, m per km (σ); an increase within it is only marginal.
+    predicted_drift: predicted drift, m per km (σ); an increase within it is only marginal.
     """
     if navigation is None or navigation.stretches < MIN_STRETCHES:
         return []
@@ -320,25 +320,24 @@ def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Rea
         if float(metres(after)) <= float(metres(before)):
             return []
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]
-    worse = finding("DRIFT_WORSE", after=after, before=before)
-    is_open = after**2 - before**2 < (2.0 * known_to) ** 2
-    return [worse.weighed(Severity.MARGINAL) if is_open else worse]
+    reason = finding("DRIFT_WORSE", after=after, before=before)
+    is_within_prediction = after**2 - before**2 < (2.0 * predicted_drift) ** 2
+    return [reason.weighed(Severity.MARGINAL) if is_within_prediction else reason]
 
 
 def in_words(navigation: Navigation) -> list[str]:
     """Return sentences that describe the drift."""
-    n, before, after = navigation, navigation.before, navigation.after
-    over = f"over stretches of {n.stretch_m:.0f} m" if n.stretches > 1 else f"over {n.distance_m:.0f} m"
-    sentences = [
+    before, after = navigation.before, navigation.after
+    is_whole = navigation.stretches == 1
+    over = f"over {navigation.distance_m:.0f} m" if is_whole else f"over stretches of {navigation.stretch_m:.0f} m"
+    end = "." if navigation.on_a_map else "; headings are unknown, so one course is assumed."
+    return [
         f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
         f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %). "
-        f"Noise of reference, attitude and DVL alone may make {metres(n.noise_per_km)} m."
+        f"Noise of reference, attitude and DVL alone may make {metres(navigation.noise_per_km)} m.",
+        f"After {navigation.distance_m:.0f} m the track is {metres(before.end)} m off as mounted, "
+        f"{metres(after.end)} m corrected{end}",
     ]
-    sentences.append(
-        f"After {n.distance_m:.0f} m it is {metres(before.end)} m off as mounted, {metres(after.end)} m corrected"
-        + ("." if n.on_a_map else "; without headings, as on one course.")
-    )
-    return sentences
 
 
 def metres(value: float) -> str:
@@ -368,19 +367,19 @@ def doubts(
     in_earth: Whether the reference is in an earth frame.
     is_level: Whether the IMU gives a heading only, see `IMU_LEVEL`.
     """
-    found = [finding("IMU_LEVEL")] if is_level else []
+    reasons = [finding("IMU_LEVEL")] if is_level else []
     if not suggested:
-        found += [each.weighed(Severity.MARGINAL) for each in lever_arm_warnings(finders, parameters)]
+        reasons += [each.weighed(Severity.MARGINAL) for each in lever_arm_warnings(finders, parameters)]
     if navigation is None:
-        return found
-    bed = moving_bed(navigation.followed, estimate)
-    if bed is not None:  # a moving bed looks like a heading error, and like a reference error
-        found.append(bed)
+        return reasons
+    bed_reason = moving_bed(navigation.followed, estimate)
+    if bed_reason is not None:  # a moving bed looks like a heading error, and like a reference error
+        reasons.append(bed_reason)
     elif navigation.deviation is not None:
-        found.append(heading_warning(navigation.deviation))
-    if in_earth and bed is None:
-        found += one_heading_warnings(estimate, parameters, navigation.speed)
-    return found + residual_warnings(
+        reasons.append(heading_warning(navigation.deviation))
+    if in_earth and bed_reason is None:
+        reasons += one_heading_warnings(estimate, parameters, navigation.speed)
+    return reasons + residual_warnings(
         navigation.followed,
         are_positions(parameters),
         confused_with_bias_std(estimate, parameters),

@@ -69,8 +69,8 @@ def noise_of_a_second(estimate: Estimate, parameters: Parameters, seconds: float
     mean_square_speed: (m/s)².
     """
     model = MODELS[estimate.model]
-    t = parameters.rotation_dvl_from_body
-    about_z = np.concatenate([t[:, 2], np.zeros(model.n_state - 3)])
+    dvl_from_body = parameters.rotation_dvl_from_body
+    about_z = np.concatenate([dvl_from_body[:, 2], np.zeros(model.n_state - 3)])
     information = about_z @ np.linalg.pinv(estimate.filter_covariance) @ about_z
     from_data = information - parameters.initial_std_misalignment**-2
     if model.aided and from_data > 0.0 and seconds > 0.0:
@@ -86,19 +86,19 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
     """
     model = MODELS[estimate.model]
     target, rows = parameters.target_drift, drift_rows(model, parameters)
-    now = predicted_drift(model, estimate.velocity_covariance, parameters)
-    if now.both <= target:
+    drift = predicted_drift(model, estimate.velocity_covariance, parameters)
+    if drift.both <= target:
         return Outlook(is_good_enough(model), None)
     if not estimate.used or motion.speed < parameters.min_speed or motion.speed <= 0.0:
         return Outlook(finding("NEXT_WAIT"), None)
     # correlated samples hold less information than the filter assumes, by this factor
-    claimed = predicted_drift(model, estimate.filter_covariance, parameters)
-    shared = max(1.0, (now.both / max(claimed.both, 1e-9)) ** 2)
-    tried = [
-        (reason, _information(model, parameters, motion, *course) / shared)
+    claimed_drift = predicted_drift(model, estimate.filter_covariance, parameters)
+    excess = max(1.0, (drift.both / max(claimed_drift.both, 1e-9)) ** 2)
+    candidates = [
+        (reason, _information(model, parameters, motion, *course) / excess)
         for reason, course in _manoeuvres(motion).values()
     ]
-    gains = np.array([gain for _, gain in tried])
+    gains = np.array([gain for _, gain in candidates])
     information = np.linalg.pinv(estimate.velocity_covariance)
     chosen, seconds = None, 0.0
     for _ in range(MAX_MANOEUVRES):
@@ -106,10 +106,10 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
         drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, posterior, rows))
         best = int(np.argmin(drifts))
         if chosen is None:
-            chosen = tried[best][0]
-            for at, (reason, _) in enumerate(tried):
+            chosen = candidates[best][0]
+            for index, (reason, _) in enumerate(candidates):
                 is_same = before is not None and (reason.code, _name(reason)) == (before.code, _name(before))
-                if is_same and now.both - drifts[best] < REPLACED_FROM * (now.both - drifts[at]):
+                if is_same and drift.both - drifts[best] < REPLACED_FROM * (drift.both - drifts[index]):
                     chosen = reason
         if drifts[best] <= target:
             return Outlook(chosen, seconds + _until(information, gains[best], rows, target))
@@ -134,44 +134,44 @@ def _until(information: Array, gain: Array, rows: Array, target: float) -> float
 def _manoeuvres(motion: RecentMotion) -> dict[str, tuple[Reason, tuple[Array, Array, Array]]]:
     """Return by name the wording, and yaw (rad), speed (m/s) and pitch (rad) over time (K,)."""
     time = np.arange(0.0, DURATION_S, STEP_S)
-    heading, u = motion.heading or 0.0, np.full(len(time), motion.speed)
+    heading, speed = motion.heading or 0.0, np.full(len(time), motion.speed)
     ahead, level = np.full(len(time), heading), np.zeros(len(time))
-    half = np.where(time < 0.5 * DURATION_S, time, DURATION_S - time)
-    changing = u * (1.0 + 0.5 * np.sin(2.0 * np.pi * time / SPEED_PERIOD_S))
-    found = {
-        "faster": (finding("NEXT_FASTER", speed=1.5 * motion.speed), (ahead, 1.5 * u, level)),
-        "speeds": (finding("NEXT_SPEEDS"), (ahead, changing, level)),
-        "port": (finding("NEXT_CIRCLE", side="port"), (heading + CIRCLE_RADPS * time, u, level)),
-        "starboard": (finding("NEXT_CIRCLE", side="starboard"), (heading - CIRCLE_RADPS * time, u, level)),
-        "eight": (finding("NEXT_EIGHT"), (heading + EIGHT_RADPS * half, u, level)),
-        "dive": (finding("NEXT_DIVE"), (ahead, u, DIVE_RAD * np.sin(2.0 * np.pi * time / DIVE_S))),
+    there_and_back = np.where(time < 0.5 * DURATION_S, time, DURATION_S - time)
+    varying = speed * (1.0 + 0.5 * np.sin(2.0 * np.pi * time / SPEED_PERIOD_S))
+    manoeuvres = {
+        "faster": (finding("NEXT_FASTER", speed=1.5 * motion.speed), (ahead, 1.5 * speed, level)),
+        "speeds": (finding("NEXT_SPEEDS"), (ahead, varying, level)),
+        "port": (finding("NEXT_CIRCLE", side="port"), (heading + CIRCLE_RADPS * time, speed, level)),
+        "starboard": (finding("NEXT_CIRCLE", side="starboard"), (heading - CIRCLE_RADPS * time, speed, level)),
+        "eight": (finding("NEXT_EIGHT"), (heading + EIGHT_RADPS * there_and_back, speed, level)),
+        "dive": (finding("NEXT_DIVE"), (ahead, speed, DIVE_RAD * np.sin(2.0 * np.pi * time / DIVE_S))),
     }
     if motion.heading is None:
-        return {"ahead": (finding("NEXT_AHEAD"), (ahead, u, level)), **found}
+        return {"ahead": (finding("NEXT_AHEAD"), (ahead, speed, level)), **manoeuvres}
     legs = {
-        name: (finding("NEXT_LEG", name=name, compass=compass), (level + math.radians(90.0 - compass), u, level))
+        name: (finding("NEXT_LEG", name=name, compass=compass), (level + math.radians(90.0 - compass), speed, level))
         for name, compass in _COMPASS
     }
-    return {**legs, **found}
+    return {**legs, **manoeuvres}
 
 
 def _information(
     model: Model, parameters: Parameters, motion: RecentMotion, yaw: Array, speed: Array, pitch: Array
 ) -> Array:
     """Return the information (n, n) that a motion adds on a model's state, from its H and noise."""
-    t = parameters.rotation_dvl_from_body
+    dvl_from_body = parameters.rotation_dvl_from_body
     ahead = np.column_stack([speed, np.zeros((len(speed), 2))])
-    (ca, sa), (cb, sb), zero = (np.cos(yaw), np.sin(yaw)), (np.cos(pitch), np.sin(pitch)), np.zeros(len(yaw))
+    (ca, sa), (cb, sb), zero = ((np.cos(yaw), np.sin(yaw)), (np.cos(pitch), np.sin(pitch)), np.zeros(len(yaw)))
     rotation = np.array([[ca * cb, -sa, ca * sb], [sa * cb, ca, sa * sb], [-sb, zero, cb]]).transpose(2, 0, 1)
     turning, pitching = np.gradient(yaw, STEP_S), np.gradient(pitch, STEP_S)
     rates = np.column_stack([-turning * np.sin(pitch), pitching, turning * np.cos(pitch)])
     if parameters.is_z_down:
         rotation, rates = rotation @ FLU_FROM_FRD, rates @ FLU_FROM_FRD
-    seen = Observations(
-        ahead @ t.T,
+    observations = Observations(
+        ahead @ dvl_from_body.T,
         ahead,
         None,
-        t,
+        dvl_from_body,
         np.zeros(2),
         noise=motion.noise * np.eye(3)[None],
         rotation_enu_from_body=rotation,
@@ -181,22 +181,22 @@ def _information(
         earth_in_body=rotation.transpose(0, 2, 1)[:, :, :2] if motion.in_earth else None,
         oriented=np.full(len(speed), motion.heading is not None),
     )
-    own = model.linearise(seen)[1]
-    h = np.zeros((len(speed), own.shape[1], model.n_state))
-    h[:, :, : own.shape[2]] = own
+    jacobian = model.linearise(observations)[1]
+    design = np.zeros((len(speed), jacobian.shape[1], model.n_state))
+    design[:, :, : jacobian.shape[2]] = jacobian
     names = model.state_names
     if model.aided and "lever_arm_x" in names:
-        at = names.index("lever_arm_x")
-        h[:, :, at : at + 3] = np.cross(np.eye(3), rates[:, None]).transpose(0, 2, 1)  # -ω×l
+        first = names.index("lever_arm_x")
+        design[:, :, first : first + 3] = np.cross(np.eye(3), rates[:, None]).transpose(0, 2, 1)  # -ω×l
     if model.aided and "time_offset" in names:
-        h[:, 0, names.index("time_offset")] = np.gradient(speed, STEP_S)
-    noise = model.noise(seen) if model.noise is not None else seen.noise
-    rows = own.shape[1]
+        design[:, 0, names.index("time_offset")] = np.gradient(speed, STEP_S)
+    noise = model.noise(observations) if model.noise is not None else observations.noise
+    rows = jacobian.shape[1]
     # an aided model's noise is per second; motion noise of the others is correlated between samples
     seconds = STEP_S if model.aided else 1.0
-    weight = seen.motion_weight if model.motion_is_noise else np.ones(len(speed))
-    weighted = np.linalg.solve(noise[:, :rows, :rows], h) * (weight * seconds)[:, None, None]
-    information: Array = np.tensordot(h, weighted, axes=((0, 1), (0, 1)))
+    weight = observations.motion_weight if model.motion_is_noise else np.ones(len(speed))
+    weighted = np.linalg.solve(noise[:, :rows, :rows], design) * (weight * seconds)[:, None, None]
+    information: Array = np.tensordot(design, weighted, axes=((0, 1), (0, 1)))
     return information
 
 

@@ -28,7 +28,7 @@ Z_SCALE_STD, BIAS_STD = 1.0, 0.1
 
 def _beams() -> Array:
     """Return E (8, 3, 3) of each beam."""
-    flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
+    flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)  # parts of a beam's direction
     along = np.radians(AZIMUTHS_DEG)
     beams = np.column_stack([flat * np.cos(along), flat * np.sin(along), np.full(len(along), -down)])
     return np.asarray((beams / [2.0 * flat**2, 2.0 * flat**2, 4.0 * down**2])[:, :, None] * beams[:, None])
@@ -43,18 +43,18 @@ def effect_velocities(v: Array) -> Array:
 
     These are the scale of z, each beam by its whole velocity, and a scale that grows with speed, by 1 per m/s.
     """
-    found = np.zeros((len(v), 3, N_EFFECTS))
-    found[:, 2, 0] = v[:, 2]
-    found[:, :, 1:-1] = -np.einsum("kij,nj->nik", BEAMS, v)
-    found[:, :, -1] = np.linalg.norm(v, axis=1)[:, None] * v
-    return found
+    velocities = np.zeros((len(v), 3, N_EFFECTS))
+    velocities[:, 2, 0] = v[:, 2]
+    velocities[:, :, 1:-1] = -np.einsum("kij,nj->nik", BEAMS, v)
+    velocities[:, :, -1] = np.linalg.norm(v, axis=1)[:, None] * v
+    return velocities
 
 
 class BeamFault(NamedTuple):
     """Most significant beam.
 
-    share, std: missing share of its velocity. azimuth_deg: in the DVL. off: resulting error of the mean velocity, as a
-    share of the speed.
+    share, std: missing share of its velocity, and σ. azimuth_deg: of the beam, from the DVL's x axis to port. off:
+    resulting error of the mean velocity, as a share of the speed.
     """
 
     share: float
@@ -64,7 +64,7 @@ class BeamFault(NamedTuple):
 
     @property
     def least(self) -> float:
-        """Return the error of the mean velocity by a beam that is better by `Z_95_PERCENT` σ."""
+        """Return the lower limit of `off`, for a beam that is better by `Z_95_PERCENT` σ."""
         return self.off * (1.0 - Z_95_PERCENT * self.std / self.share)
 
 
@@ -79,23 +79,23 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     information, vector: (n, n), (n,) prior of the states.
     mean: (3,) m/s, mean velocity in the DVL.
     """
-    n, p = len(vector), np.linalg.inv(information)
+    n_states, p = len(vector), np.linalg.inv(information)
     start = p @ vector
     p[BIAS, BIAS] += BIAS_STD**2 * np.eye(3)
     # without a vertical reference nothing else holds the scale of z
-    prior = np.diag([*np.zeros(n), Z_SCALE_STD**-2.0, 0.0])
-    prior[:n, :n] = np.linalg.inv(p)
-    vector = prior[:n, :n] @ start
-    all_blocks, found = blocks.of(0), []
+    prior = np.diag([*np.zeros(n_states), Z_SCALE_STD**-2.0, 0.0])
+    prior[:n_states, :n_states] = np.linalg.inv(p)
+    vector = prior[:n_states, :n_states] @ start
+    all_blocks, fitted = blocks.of(0), []
     for number in range(1, N_EFFECTS):
-        at = np.append(np.arange(n + 1), n + number)
-        each = all_blocks.part(at)
+        states = np.append(np.arange(n_states + 1), n_states + number)
+        each = all_blocks.part(states)
         if each.total[-1, -1] <= 0.0:
             continue
         p = np.linalg.inv(prior + each.total)
         x = p @ (each.vector.sum(axis=0) + np.append(vector, [0.0, 0.0]))
-        found.append((float(x[-1]), math.sqrt(p[-1, -1]) * float(inflations([each], x[None], p[None])[0, -1]), number))
-    share, std, number = max(found, key=lambda each: abs(each[0]) / each[1], default=(0.0, 1.0, N_EFFECTS - 1))
+        fitted.append((float(x[-1]), math.sqrt(p[-1, -1]) * float(inflations([each], x[None], p[None])[0, -1]), number))
+    share, std, number = max(fitted, key=lambda each: abs(each[0]) / each[1], default=(0.0, 1.0, N_EFFECTS - 1))
     if number == N_EFFECTS - 1:
         return None
     relative = abs(share) * float(np.linalg.norm(BEAMS[number - 1] @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)

@@ -52,9 +52,9 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     dvl, pairing = counts["dvl"], counts["pairing"]
     found = []
     if dvl["received"] >= FEWEST_SAMPLES and not dvl["accepted"]:
-        lost = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
-        found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=lost))
-    if _never_meet(counts):
+        reasons = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
+        found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=reasons))
+    if _is_nothing_paired(counts):
         found.append(finding("DVL_NO_REFERENCE"))
     if pairing["without_attitude"] > UNIMPORTANT_SHARE * dvl["received"]:
         found.append(finding("REFERENCE_NO_ATTITUDE", count=pairing["without_attitude"]))
@@ -78,7 +78,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     return found
 
 
-def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
+def _is_nothing_paired(counts: Mapping[str, Mapping[str, int]]) -> bool:
     """Return whether enough valid DVL and reference samples arrived, but none could be paired."""
     reference, pairing = counts["reference"], counts["pairing"]
     usable = 2 * reference["received"] - sum(reference.values())
@@ -104,17 +104,17 @@ def consistency_warnings(estimate: Estimate) -> list[Reason]:
 
 def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: float) -> list[Reason]:
     """Return a warning if only priors separate a constant velocity error from yaw and scale. speed: usual, m/s."""
-    own, assumed = estimate.state_names, parameters.reference_offset_std
-    if OFFSETS[0] not in own or not estimate.used or speed <= 0.0:
+    names, assumed = estimate.state_names, parameters.reference_offset_std
+    if OFFSETS[0] not in names or not estimate.used or speed <= 0.0:
         return []
-    at = [own.index(name) for name in OFFSETS]
-    turn, p = parameters.rotation_dvl_from_body[:, 2], estimate.filter_covariance
-    yaw_by_offset = np.linalg.solve(p[np.ix_(at, at)], p[at, :3] @ turn)
+    offset_states = [names.index(name) for name in OFFSETS]
+    body_z, p = parameters.rotation_dvl_from_body[:, 2], estimate.filter_covariance
+    yaw_by_offset = np.linalg.solve(p[np.ix_(offset_states, offset_states)], p[offset_states, :3] @ body_z)
     if float(np.linalg.norm(yaw_by_offset)) * speed < INSEPARABLE_SHARE:
         return []
-    off = MAX_OFFSET_RATIO * assumed
-    share = off / speed
-    return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
+    largest_offset = MAX_OFFSET_RATIO * assumed
+    share = largest_offset / speed
+    return [finding("ONE_HEADING", off=largest_offset, degrees=math.degrees(share), percent=100.0 * share)]
 
 
 def reference_warnings(estimate: Estimate) -> list[Reason]:
@@ -126,10 +126,10 @@ def reference_warnings(estimate: Estimate) -> list[Reason]:
     if open_std.any():
         by_name = dict(zip(estimate.state_names, open_std.tolist(), strict=True))
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
-        turn = math.degrees(float(np.linalg.norm(open_std[:3])))
+        degrees = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
         if metres >= TAPE_STD_M or seconds >= REPORTED_FROM_S:
-            reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
-        elif turn >= REPORTED_FROM_DEG:  # the lever arm is configured
-            reasons.append(finding("CLOCK_ON_TURN", degrees=turn))
+            reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=degrees, seconds=seconds))
+        elif degrees >= REPORTED_FROM_DEG:  # the lever arm is configured
+            reasons.append(finding("CLOCK_ON_TURN", degrees=degrees))
     return reasons

@@ -39,17 +39,17 @@ class DvlStream:
         """Add a block of consecutive DVL velocities (N, 3) m/s."""
         if len(velocity) < FEWEST_VALUES:
             return
-        one, two = steps(velocity), velocity[2:] - velocity[:-2]
-        near, far = (float(median((each**2).sum(axis=1))) for each in (two, one))
+        change, change_of_two = steps(velocity), velocity[2:] - velocity[:-2]
+        square_of_two, square_of_one = (float(median((each**2).sum(axis=1))) for each in (change_of_two, change))
         self._blocks += 1
-        self._alternating += far > CHANGE_RATIO * near + CHANGE_MPS2
-        self._n += len(one)
-        size = np.abs(one)
-        self._repeated += (size < 1e-6).sum(axis=0)
-        self._step = np.minimum(self._step, np.where(size < 1e-6, math.inf, size).min(axis=0))
+        self._alternating += square_of_one > CHANGE_RATIO * square_of_two + CHANGE_MPS2
+        self._n += len(change)
+        magnitude = np.abs(change)
+        self._repeated += (magnitude < 1e-6).sum(axis=0)
+        self._step = np.minimum(self._step, np.where(magnitude < 1e-6, math.inf, magnitude).min(axis=0))
         self._is_dead &= (velocity == 0.0).all(axis=0)
         self._square += float((velocity**2).sum())
-        self._noise = max(self._noise, math.sqrt(float(median(steps(steps(one)) ** 2).max()) / 20.0))
+        self._noise = max(self._noise, math.sqrt(float(median(steps(steps(change)) ** 2).max()) / 20.0))
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the data are not one DVL's measurements."""

@@ -53,8 +53,8 @@ def heading_deviation(yaw: Array, coefficients: GaussianState) -> HeadingDeviati
     deviation = terms @ coefficients.x
     rms = float(np.sqrt((deviation**2).mean()))
     std = math.sqrt(max(float(np.einsum("ni,ij,nj->n", terms, coefficients.p, terms).mean()), 0.0))
-    found = float(coefficients.x @ np.linalg.solve(coefficients.p, coefficients.x))
-    if rms < REPORTED_FROM_RAD or found < chi2_isf(chance_of(Z_ONE_TEST), len(coefficients.x)):
+    chi_square = float(coefficients.x @ np.linalg.solve(coefficients.p, coefficients.x))
+    if rms < REPORTED_FROM_RAD or chi_square < chi2_isf(chance_of(Z_ONE_TEST), len(coefficients.x)):
         return None
     most, least = int(np.argmax(deviation)), int(np.argmin(deviation))
     north = (0.5 * math.pi - yaw) % (2.0 * math.pi)
@@ -67,8 +67,8 @@ def heading_warning(found: HeadingDeviation) -> Reason:
     """Return the warning; it rejects a calibration if the compass must be calibrated before the mounting."""
     degrees = math.degrees
     is_first = found.rms > max(FIRST, Z_ONE_TEST * found.std)
-    first = "calibrate the compass first: " if is_first else ""
-    said = finding(
+    first = " first" if is_first else ""
+    warning = finding(
         "HEADING_DEVIATION",
         rms=degrees(found.rms),
         std=degrees(found.std),
@@ -79,4 +79,4 @@ def heading_warning(found: HeadingDeviation) -> Reason:
         cost=1000.0 * found.rms,
         first=first,
     )
-    return said.weighed(Severity.REJECT if is_first else Severity.WARNING)
+    return warning.weighed(Severity.REJECT if is_first else Severity.WARNING)

@@ -37,25 +37,21 @@ LEVEL_BELOW = 1e-6
 _BODY, _ENU, _NED = range(3)
 _AXES = "xyz"
 _INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
-_KNOWN = {
-    (1, 1, -1): "HEADING_CLOCKWISE",
-    (-1, -1, -1): "RATES_NEGATED",
-    (1, -1, -1): "IMU_AXES_MIXED",
-}
+_NAMED_SIGNS = {(1, 1, -1): "HEADING_CLOCKWISE", (-1, -1, -1): "RATES_NEGATED", (1, -1, -1): "IMU_AXES_MIXED"}
 
 
 def _conventions() -> Iterator[tuple[Reason, Array]]:
-    """Yield all exchanged or negated axes as B (3, 3), turn rate = B angular velocity; likely ones first.
+    """Yield each exchange or negation of axes: its finding and B (3, 3), turn rate = B angular velocity. Likely first.
 
     On a level vehicle that only turns about z, many fit equally.
     """
-    known_ones = [(finding(code), np.diag(signs).astype(float)) for signs, code in _KNOWN.items()]
-    yield from known_ones
+    named = [(finding(code), np.diag(signs).astype(float)) for signs, code in _NAMED_SIGNS.items()]
+    yield from named
     for order in permutations(range(3)):
         for signs in all_of((1, -1), repeat=3):
             axes = ", ".join("-"[: sign < 0] + _AXES[axis] for sign, axis in zip(signs, order, strict=True))
             matrix = np.diag(signs).astype(float) @ np.eye(3)[list(order)]
-            if axes != "x, y, z" and not any((matrix == known).all() for _, known in known_ones):
+            if axes != "x, y, z" and not any((matrix == named_matrix).all() for _, named_matrix in named):
                 yield finding("RATES_EXCHANGED", axes=axes), matrix
 
 
@@ -93,10 +89,10 @@ class AttitudeRates:
         before, after = orientation[first], orientation[last]
         a = rotation_vector(quaternion_product(before * _INVERSE, after)) / seconds[:, None]
         steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
-        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        w = (sums[last] - sums[first]) / seconds[:, None]
-        good = seconds <= LONGEST_S
-        a, w, before, after = a[good], w[good], before[good], after[good]
+        angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        w = (angles[last] - angles[first]) / seconds[:, None]
+        is_short = seconds <= LONGEST_S
+        a, w, before, after = (a[is_short], w[is_short], before[is_short], after[is_short])
         middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
@@ -114,20 +110,20 @@ class AttitudeRates:
 
     def contradiction(self) -> Reason | None:
         """Return the reason, and the convention that fits, if attitude and angular velocity disagree."""
-        shown = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
-        total = float(np.trace(self._turning[shown, shown]))
+        axes = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
+        total = float(np.trace(self._turning[axes, axes]))
         if self._n < FEWEST_OF_MOTION or total < self._n * MIN_TURN_RADPS**2:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")
-        given = self._misfit(_BODY, np.eye(3), shown)
+        given = self._misfit(_BODY, np.eye(3), axes)
         if given < MIN_WRONG_SHARE * total:
             return None
-        explained = [(self._misfit(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
-        best = min(left for left, _ in explained)
+        misfits = [(self._misfit(frame, matrix, axes), fits) for frame, matrix, fits in self._explanations()]
+        best = min(misfit for misfit, _ in misfits)
         if best > MAX_LEFT_SHARE * min(total, given):
             return None
-        found, *others = (fits for left, fits in explained if left <= EQUAL_FACTOR * best + 1e-3 * total)
+        found, *others = (fits for misfit, fits in misfits if misfit <= EQUAL_FACTOR * best + 1e-3 * total)
         if others:
             return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
         return finding("IMU_CONTRADICTS", found=found)
@@ -142,8 +138,8 @@ class AttitudeRates:
     def _explanations(self) -> Iterator[tuple[int, Array, Reason]]:
         """Yield possible conventions: frame of the angular velocity, B (3, 3), and wording."""
         yield from ((_BODY, matrix, convention) for convention, matrix in CONVENTIONS)
-        both, rates = self._both[_BODY], self._rates[_BODY]
-        scale = float(np.trace(both) / np.trace(rates))
+        attitude_by_imu, imu_by_imu = self._both[_BODY], self._rates[_BODY]
+        scale = float(np.trace(attitude_by_imu) / np.trace(imu_by_imu))
         if scale > 0.0 and abs(math.log(scale)) > SCALED_FROM:
             in_degrees = abs(math.log(scale * 180.0 / math.pi)) < SCALED_FROM
             size = finding("RATES_DEGREES") if in_degrees else finding("RATES_SCALED", times=1.0 / scale)
@@ -151,11 +147,11 @@ class AttitudeRates:
         yield _ENU, np.eye(3), finding("RATES_IN_EARTH", frame="ENU")
         yield _NED, np.eye(3), finding("RATES_IN_EARTH", frame="NED")
         yield _ENU, -np.eye(3), finding("ATTITUDE_INVERTED")
-        u, _, vt = np.linalg.svd(both)
-        turned = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
-        angle = math.degrees(math.acos(float(np.clip(0.5 * (np.trace(turned) - 1.0), -1.0, 1.0))))
-        if angle > TURNED_FROM_DEG and np.abs(turned).max(axis=1).min() < EXCHANGED_FROM:
-            yield _BODY, turned, finding("RATES_TURNED", degrees=angle)
+        u, _, vt = np.linalg.svd(attitude_by_imu)
+        rotation = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
+        angle = math.degrees(math.acos(float(np.clip(0.5 * (np.trace(rotation) - 1.0), -1.0, 1.0))))
+        if angle > TURNED_FROM_DEG and np.abs(rotation).max(axis=1).min() < EXCHANGED_FROM:
+            yield _BODY, rotation, finding("RATES_TURNED", degrees=angle)
 
 
 def _spans(times: Array) -> Index:
@@ -165,6 +161,6 @@ def _spans(times: Array) -> Index:
     number = np.floor((times - start) / step)
     number += start + (number + 1.0) * step <= times
     number -= start + number * step > times
-    at, last = np.flatnonzero(np.diff(number, prepend=-1.0)), len(times) - 1
-    at = at if at[-1] == last else np.append(at, last)
-    return np.stack([at[:-1], at[1:]])
+    starts, last = np.flatnonzero(np.diff(number, prepend=-1.0)), len(times) - 1
+    starts = starts if starts[-1] == last else np.append(starts, last)
+    return np.stack([starts[:-1], starts[1:]])

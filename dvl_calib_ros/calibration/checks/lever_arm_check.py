@@ -27,14 +27,14 @@ def lever_arm_warnings(estimates: Iterable[Estimate], parameters: Parameters) ->
         return []
     # without the clock's uncertainty: a delay, which looks the same at constant speed, is one of the causes
     state = GaussianState(estimate.state, estimate.covariance - estimate.left_open)
-    off = contradicts_configured_arm(MODELS[estimate.model], state, parameters)
-    if not off.any():
+    is_contradicted = contradicts_configured_arm(MODELS[estimate.model], state, parameters)
+    if not is_contradicted.any():
         return []
     arm = estimate.lever_arm(parameters.lever_arm)
     std = estimate.std[[estimate.state_names.index(name) for name in ARM]]
     axes = ", ".join(
         f"{axis} {arm[i]:+.2f} m ± {std[i]:.2f} for {parameters.lever_arm[i]:+.2f}"
         for i, axis in enumerate("xyz")
-        if off[i]
+        if is_contradicted[i]
     )
     return [finding("LEVER_ARM_CONTRADICTED", axes=axes)]

@@ -72,8 +72,8 @@ class SharedNoise:
         # at the slower stream's times, with the nearest samples of the faster one
         if reference_step > SLOWEST_S:
             columns = np.column_stack([velocity, np.diff(velocity, 2, axis=0, prepend=np.nan, append=np.nan)])[2:-2]
-            seen = np.column_stack([columns, np.where(_evenly(times, step), fourth, np.nan)])
-            dvl, dvl_2, dvl_4 = np.split(_nearest(reference_times, step, times[2:-2], seen, -SHIFTS_S), 3, axis=2)
+            orders = np.column_stack([columns, np.where(_evenly(times, step), fourth, np.nan)])
+            dvl, dvl_2, dvl_4 = np.split(_nearest(reference_times, step, times[2:-2], orders, -SHIFTS_S), 3, axis=2)
             # equivalent to a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
             other_4 = dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl)
         elif reference_step < step:
@@ -91,11 +91,11 @@ class SharedNoise:
         c_4, v_4, v_2 = np.stack([dvl_4 * other_4, dvl_4 * dvl_4, dvl_2 * dvl_2]).sum(axis=(2, 3)) / np.maximum(
             count, 1
         )
-        enough = count >= (MIN_DIFFERENCES if reference_step <= SLOWEST_S else FEWEST_VALUES)
-        found = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * enough[:, None]
-        self._stretches += enough
-        self._sums += found
-        self._squares += found**2
+        is_enough = count >= (MIN_DIFFERENCES if reference_step <= SLOWEST_S else FEWEST_VALUES)
+        sums = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * is_enough[:, None]
+        self._stretches += is_enough
+        self._sums += sums
+        self._squares += sums**2
 
     def share(self) -> float:
         """Return the share of the DVL's noise in the reference, 0 to about 1; 0 if not significant."""
@@ -105,13 +105,13 @@ class SharedNoise:
         mean = self._sums / n
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
         best = int(np.argmax(np.where(self._stretches >= FEWEST_VALUES, mean[:, 0], -math.inf)))
-        c_4, v_4, steps = mean[best].tolist()
-        if steps < Z_ONE_TEST * float(std[best, 2]):
-            steps = 0.0
-        passed, own = c_4 - steps, v_4 - steps
-        if own < max(MIN_NOISE_SHARE * v_4, 70.0 * ROUNDING_MPS**2):
+        c_4, v_4, motion = mean[best].tolist()
+        if motion < Z_ONE_TEST * float(std[best, 2]):
+            motion = 0.0
+        shared, noise = c_4 - motion, v_4 - motion
+        if noise < max(MIN_NOISE_SHARE * v_4, 70.0 * ROUNDING_MPS**2):
             return 0.0
-        return passed / own if passed > max(SHARED_FROM * own, Z_BEST_SHIFT * float(std[best, 0])) else 0.0
+        return shared / noise if shared > max(SHARED_FROM * noise, Z_BEST_SHIFT * float(std[best, 0])) else 0.0
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the reference contains the DVL's noise."""
@@ -145,7 +145,7 @@ def _even(times: Array, step: float) -> Mask:
 
 def _windows(even: Mask, order: int) -> Mask:
     """Return which differences (N - order,) have only even steps (N - 1,)."""
-    whole: Mask = even[: len(even) - order + 1].copy()
+    is_even: Mask = even[: len(even) - order + 1].copy()
     for at in range(1, order):
-        whole &= even[at : len(even) - order + 1 + at]
-    return whole
+        is_even &= even[at : len(even) - order + 1 + at]
+    return is_even

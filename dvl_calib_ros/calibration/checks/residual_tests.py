@@ -118,7 +118,7 @@ class _Fit(NamedTuple):
     weight: Array
     starts: Index
 
-    def seen_of(self, columns: Array, values: Array) -> float:
+    def last_coefficient(self, columns: Array, values: Array) -> float:
         """Return the coefficient of the last column of (N, 3, n) in values (N, 3), adjusted for the others."""
         return float(self.p[-1] @ np.einsum("n,nij,ni->j", self.weight, columns, values))
 
@@ -126,7 +126,7 @@ class _Fit(NamedTuple):
 def residual_trend(
     time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
 ) -> ResidualTrend | None:
-    """Fit the residual velocity; None for too little data.
+    """Fit tilt and smoothing to all samples, bias and moving bed to means; None for too little data.
 
     Parameters
     ----------
@@ -149,79 +149,79 @@ def residual_trend(
     moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
     n = len(time)
     yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
-    passed = (time - time.mean()) / (time[-1] - time[0])
-    around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), passed])
-    quick = np.zeros((n, 3, 3))
+    progress = (time - time.mean()) / (time[-1] - time[0])
+    heading_terms = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), progress])
+    fast_signals = np.zeros((n, 3, 3))
     for axis in range(2):
-        about = np.zeros((n, 3))
-        about[:, axis] = -changing[axis]
-        quick[:, :, axis] = cross(about, moving)
+        tilt_axis = np.zeros((n, 3))
+        tilt_axis[:, axis] = -changing[axis]
+        fast_signals[:, :, axis] = cross(tilt_axis, moving)
     # second derivative of means, so that DVL noise is common to all samples of a mean
     turning = _mean(time, _turned(rotation_enu_from_body, _mean(time, velocity - error, MEAN_S)), BEND_S)
     bend, whole_bend = (
         (_at(time, each, BEND_S) - 2.0 * each + _at(time, each, -BEND_S)) / BEND_S**2 for each in (turning, earth)
     )
-    quick[:, :, 2] = _turned(body_from_enu, bend)
+    fast_signals[:, :, 2] = _turned(body_from_enu, bend)
     # linear interpolation loses this part of the second derivative on average
-    bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
-    both = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), quick], axis=2)
-    fast = _fitted(time, both, bent, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
-    constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
+    fast_residual = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
+    fast_columns = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), fast_signals], axis=2)
+    fast_fit = _fitted(time, fast_columns, fast_residual, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
+    bias_columns = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
-    known = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
-    by_heading = known[:, :, -1, None] * around[:, None]
-    columns = np.concatenate([_means(each, starts) for each in (known, by_heading, constant)], axis=2)
-    likely = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
+    nuisance = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
+    by_heading = nuisance[:, :, -1, None] * heading_terms[:, None]
+    columns = np.concatenate([_means(each, starts) for each in (nuisance, by_heading, bias_columns)], axis=2)
+    prior_std = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
     means = _means(time, starts), columns, _means(error, starts)
-    slow = _fitted(*means, likely, LASTING)
-    likely[OVER_GROUND] = BED_STD_MPS
-    over_bed = _fitted(*means, likely, LASTING)
-    if fast is None or slow is None or over_bed is None:
+    bias_fit = _fitted(*means, prior_std, LASTING)
+    prior_std[OVER_GROUND] = BED_STD_MPS
+    bed_fit = _fitted(*means, prior_std, LASTING)
+    if fast_fit is None or bias_fit is None or bed_fit is None:
         return None
-    over_ground = over_bed.x[OVER_GROUND]
+    over_ground = bed_fit.x[OVER_GROUND]
     # on few headings yaw and bias can compensate any bed velocity, with a small residual
-    if float(over_ground @ median(_turned(rotation_enu_from_body, error)[:, :2])) < 0.5 * float(
-        over_ground @ over_ground
-    ):
+    residual_over_ground = median(_turned(rotation_enu_from_body, error)[:, :2])
+    if float(over_ground @ residual_over_ground) < 0.5 * float(over_ground @ over_ground):
         over_ground = np.zeros(2)
-    tilt, std = fast.x[-3:-1], fast.std[-3:-1]
+    tilt, std = fast_fit.x[-3:-1], fast_fit.std[-3:-1]
     std[[each.std() < LEAST_TILT for each in changing]] = math.inf
     lean = np.array([roll.mean(), pitch.mean()])
     speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
     # without tilt data, wave motion looks like turning
-    shows = max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
+    is_observable = max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
     # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
-    bends_by = fast.seen_of(both, _turned(body_from_enu, whole_bend))
-    shows = shows and bends_by > LEAST_OF_BEND
-    smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
+    bend_gain = fast_fit.last_coefficient(fast_columns, _turned(body_from_enu, whole_bend))
+    is_observable = is_observable and bend_gain > LEAST_OF_BEND
+    smoothed = fast_fit.x[-1] / bend_gain if is_observable else 0.0
+    smoothed_std = fast_fit.std[-1] / bend_gain if is_observable else math.inf
     return ResidualTrend(
-        tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_noise_in_reference(time, velocity - error, error, both, fast, interval_s), over_ground,
-        over_bed.std[OVER_GROUND], float(slow.x[-4]), float(slow.std[-4]),
+        tilt, std, bias_fit.x[-3:], bias_fit.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
+        *_noise_in_reference(time, velocity - error, error, fast_columns, fast_fit, interval_s), over_ground,
+        bed_fit.std[OVER_GROUND], float(bias_fit.x[-4]), float(bias_fit.std[-4]),
     )  # fmt: skip
 
 
 def _nuisance_columns(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
     """Return nuisance columns (N, 3, 14) from velocity, turn rate and acceleration (N, 3), body axes."""
-    known = np.zeros((len(moving), 3, len(NUISANCE_STD)))
-    known[:, :, :3] = skew(moving)
-    known[:, [0, 1, 2], [3, 4, 5]] = moving
-    known[:, :, 6:9] = skew(rates)
-    known[:, :, 9] = slope
-    known[:, :, 10:13] = body_from_enu
-    known[:, :, 13] = cross(moving, body_from_enu[:, :, 2])
-    return known
+    columns = np.zeros((len(moving), 3, len(NUISANCE_STD)))
+    columns[:, :, :3] = skew(moving)
+    columns[:, [0, 1, 2], [3, 4, 5]] = moving
+    columns[:, :, 6:9] = skew(rates)
+    columns[:, :, 9] = slope
+    columns[:, :, 10:13] = body_from_enu
+    columns[:, :, 13] = cross(moving, body_from_enu[:, :, 2])
+    return columns
 
 
 def _neighbouring_means(time: Array, values: Array, starts: Index) -> Array:
     """Return for each value (N, 3) the mean of the neighbouring stretches, or of its own if these are far in time."""
-    at, of_each = _means(time, starts), _means(values, starts)
-    near = (np.diff(at) < 2.0 * MEAN_S).astype(float)[:, None]
-    before, after = np.vstack([[[0.0]], near]), np.vstack([near, [[0.0]]])
-    around = before * np.roll(of_each, 1, axis=0) + after * np.roll(of_each, -1, axis=0)
-    alone = before + after == 0.0
-    means = np.where(alone, of_each, around / np.where(alone, 1.0, before + after))
+    mean_times, stretch_means = _means(time, starts), _means(values, starts)
+    is_near = (np.diff(mean_times) < 2.0 * MEAN_S).astype(float)[:, None]
+    before, after = np.vstack([[[0.0]], is_near]), np.vstack([is_near, [[0.0]]])
+    neighbour_mean = before * np.roll(stretch_means, 1, axis=0) + after * np.roll(stretch_means, -1, axis=0)
+    is_alone = before + after == 0.0
+    means = np.where(is_alone, stretch_means, neighbour_mean / np.where(is_alone, 1.0, before + after))
     return np.repeat(means, np.diff(starts, append=len(time)), axis=0)
 
 
@@ -244,11 +244,11 @@ def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None
     size = float(np.linalg.norm(found.over_ground))
     if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < Z_SLOW_ERRORS * found.over_ground_std).all():
         return None
-    own = [estimate.state_of(name) for name in OFFSETS]
-    is_held = float(np.linalg.norm(found.over_ground - own)) < 0.5 * size
+    estimated_error = [estimate.state_of(name) for name in OFFSETS]
+    is_held = float(np.linalg.norm(found.over_ground - estimated_error)) < 0.5 * size
     course = math.degrees(math.atan2(*found.over_ground)) % 360.0
-    moves = finding("BED_MOVES", millimetres=1000.0 * size, course=course, std=float(f"{size:.1g}"))
-    return moves.weighed(Severity.MARGINAL if is_held else Severity.REJECT)
+    reason = finding("BED_MOVES", millimetres=1000.0 * size, course=course, std=float(f"{size:.1g}"))
+    return reason.weighed(Severity.MARGINAL if is_held else Severity.REJECT)
 
 
 def residual_warnings(
@@ -283,34 +283,34 @@ def residual_warnings(
     for axis, name in enumerate(("roll", "pitch")):
         share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
         if abs(share) > max(Z_SLOW_ERRORS * std, MISSING_TILT_SHARE):
-            off = abs(share * float(found.lean[axis]))
-            severity = Severity.REJECT if off > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
-            found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
+            error = abs(share * float(found.lean[axis]))
+            severity = Severity.REJECT if error > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
+            found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(error))
             reasons.append(found_tilt.weighed(severity))
         elif std > TILT_UNOBSERVABLE_STD and abs(float(found.lean[axis])) > accepted:
             reasons.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     # the heading at either end, relative to its mean
-    off = 0.5 * abs(found.turned)
-    if off > REPORTED_FROM_RAD and off > Z_ONE_TEST * found.turned_std:
-        severity = Severity.MARGINAL if off > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
+    error = 0.5 * abs(found.turned)
+    if error > REPORTED_FROM_RAD and error > Z_ONE_TEST * found.turned_std:
+        severity = Severity.MARGINAL if error > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
-        reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(severity))
+        reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(error)).weighed(severity))
     if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
         reasons += beam_warning(beam, max(accepted, second_order))
     magnitude = np.abs(found.bias)
-    shown = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
-    if shown.any():
+    is_significant = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
+    if is_significant.any():
         axes = ", ".join(
             f"{axis} {1000.0 * found.bias[i]:+.0f} ± {1000.0 * found.bias_std[i]:.0f}"
             for i, axis in enumerate("xyz")
-            if shown[i]
+            if is_significant[i]
         )
-        turned = float(magnitude[shown].max()) / found.speed
+        angle = float(magnitude[is_significant].max()) / found.speed
         is_wrong = (
             magnitude - found.bias_std > np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * found.speed
         )
-        severity = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
-        reasons.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(severity))
+        severity = Severity.REJECT if (is_significant & is_wrong).any() else Severity.MARGINAL
+        reasons.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(angle)).weighed(severity))
     elif float(found.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
         share = TYPICAL_BIAS_MPS / found.speed
         reasons.append(finding("ONE_SPEED", off=TYPICAL_BIAS_MPS, degrees=math.degrees(share), percent=100.0 * share))
@@ -322,39 +322,39 @@ def _smoothed_one(found: ResidualTrend) -> str:
 
 
 def _fitted(
-    time: Array, columns: Array, error: Array, likely: Array, together: Sequence[int] = QUICK_STRETCHES
+    time: Array, columns: Array, error: Array, prior_std: Array, group_sizes: Sequence[int] = QUICK_STRETCHES
 ) -> _Fit | None:
-    """Fit error (N, 3) = columns (N, 3, n) x; None for too few stretches."""
+    """Fit error (N, 3) = columns (N, 3, n) x robustly, σ from the scatter of stretches; None for too few stretches."""
     stretch = np.floor((time - time[0]) / STRETCH_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(stretch, prepend=-1))
     if len(starts) < FEWEST_VALUES:
         return None
     n = columns.shape[2]
-    rest = error
+    residual = error
     for _ in range(ROBUST_PASSES):
-        square = (rest**2).sum(axis=1)
-        level = max(float(median(square)), QUIETEST_MPS**2)
-        weight = 1.0 / np.maximum(square / (OUTLIER_RATIO**2 * level), 1.0)
+        square = (residual**2).sum(axis=1)
+        noise = max(float(median(square)), QUIETEST_MPS**2)
+        weight = 1.0 / np.maximum(square / (OUTLIER_RATIO**2 * noise), 1.0)
         weighted = columns * weight[:, None, None]
-        flat, z = columns.reshape(-1, n), error.reshape(-1)
-        prior = level / 3.0 / likely**2
-        p = np.linalg.inv(weighted.reshape(-1, n).T @ flat + np.diag(prior))
-        x = p @ (weighted.reshape(-1, n).T @ z)
-        rest = error - columns @ x
-    scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
+        design, observed = columns.reshape(-1, n), error.reshape(-1)
+        prior = noise / 3.0 / prior_std**2
+        p = np.linalg.inv(weighted.reshape(-1, n).T @ design + np.diag(prior))
+        estimate = p @ (weighted.reshape(-1, n).T @ observed)
+        residual = error - columns @ estimate
+    scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, residual), starts, axis=0)
     # one axis at a time to save memory: hours of data would need a tenth of a gigabyte
     each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
     contributions = np.sum(each_axis, axis=0)
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
-    by_prior = p[:, : len(NUISANCE_STD)] * (prior * likely)[: len(NUISANCE_STD)]
-    std = student_factor(effective_blocks(contributions[None])[0] - 1.0) * _std(p @ scores.T, together)
-    return _Fit(x, np.sqrt(std**2 + (by_prior**2).sum(axis=1)), p, weight, starts)
+    prior_error = p[:, : len(NUISANCE_STD)] * (prior * prior_std)[: len(NUISANCE_STD)]
+    std = student_factor(effective_blocks(contributions[None])[0] - 1.0) * _std(p @ scores.T, group_sizes)
+    return _Fit(estimate, np.sqrt(std**2 + (prior_error**2).sum(axis=1)), p, weight, starts)
 
 
-def _std(scatter: Array, together: Sequence[int]) -> Array:
+def _std(scatter: Array, group_sizes: Sequence[int]) -> Array:
     """Return the largest σ (n,) from scatter (n, M) of stretches and of their groups, as noise is correlated."""
     n, m = scatter.shape
-    sums = [scatter[:, : m // k * k].reshape(n, -1, k).sum(axis=2) for k in together if m >= 2 * k]
+    sums = [scatter[:, : m // k * k].reshape(n, -1, k).sum(axis=2) for k in group_sizes if m >= 2 * k]
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
@@ -372,11 +372,11 @@ def _noise_in_reference(
     # in slower streams the innovation is motion, and a reference that is interpolated follows the motion before
     if max(step, interval_s) > SLOWEST_S or len(time) < 4 * NEIGHBOURS:
         return 0.0, math.inf, 0.0
-    innovation, rest = (np.zeros_like(dvl) for _ in range(2))
+    innovation, kept = (np.zeros_like(dvl) for _ in range(2))
     for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):
         shares = _innovation_filter(values)
-        for filtered, each in ((innovation, values), (rest, error[:, axis])):
-            filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
+        for past, each in ((innovation, values), (kept, error[:, axis])):
+            past[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
     limit = OUTLIER_RATIO * robust_std(innovation)
     # gaps break the prediction
     is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
@@ -388,43 +388,43 @@ def _noise_in_reference(
         weighted = fit.weight[:, None] * values
         return np.asarray(values - columns @ (fit.p @ np.einsum("nij,ni->j", columns, weighted)))
 
-    now = without_columns(noise)
-    level = np.maximum(np.einsum("n,ni,ni->i", weight, now, now), 1e-18)
+    current = without_columns(noise)
+    noise_power = np.maximum(np.einsum("n,ni,ni->i", weight, current, current), 1e-18)
 
     def without_now(values: Array) -> Array:
-        return np.asarray(values - now * (np.einsum("n,ni,ni->i", weight, now, values) / level))
+        return np.asarray(values - current * (np.einsum("n,ni,ni->i", weight, current, values) / noise_power))
 
-    rest, found = without_now(rest), []
+    kept, candidates = without_now(kept), []
     for seconds in FILTER_MEMORIES_S:
-        for late in (0.0, seconds):  # the lag may have been corrected as a delay
-            past = without_now(without_columns(_filtered_noise(noise, step, seconds, late)))
+        for corrected_lag in (0.0, seconds):  # the lag may have been corrected as a delay
+            past = without_now(without_columns(_filtered_noise(noise, step, seconds, corrected_lag)))
             square = float(np.einsum("n,ni,ni->", weight, past, past))
             if square <= 0.0:
                 continue
-            share = float(np.einsum("n,ni,ni->", weight, past, rest)) / square
-            scores = np.add.reduceat(weight * (past * (rest - share * past)).sum(axis=1), fit.starts)
+            share = float(np.einsum("n,ni,ni->", weight, past, kept)) / square
+            scores = np.add.reduceat(weight * (past * (kept - share * past)).sum(axis=1), fit.starts)
             std = math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES)
             if share - Z_95_PERCENT * std < 1.0:  # no filter makes more of the noise than there is: that is motion
-                found.append((share, std, seconds))
-    return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
+                candidates.append((share, std, seconds))
+    return max(candidates, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 
-def _filtered_noise(noise: Array, step: float, seconds: float, late: float) -> Array:
-    """Return a filter's output from earlier noise (N, 3). seconds: memory. late: lag that is corrected, s."""
+def _filtered_noise(noise: Array, step: float, seconds: float, corrected_lag: float) -> Array:
+    """Return a filter's output from earlier noise (N, 3). seconds: memory. corrected_lag: lag that is corrected, s."""
     kernel = np.exp(-np.arange(math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
-    ahead = int(late / step + 1e-6)
-    kernel[ahead] = 0.0
-    made = np.column_stack([np.convolve(np.append(each, np.zeros(ahead)), kernel) for each in noise.T])
-    return np.asarray(made[ahead : ahead + len(noise)])
+    n_ahead = int(corrected_lag / step + 1e-6)
+    kernel[n_ahead] = 0.0
+    output = np.column_stack([np.convolve(np.append(each, np.zeros(n_ahead)), kernel) for each in noise.T])
+    return np.asarray(output[n_ahead : n_ahead + len(noise)])
 
 
 def _innovation_filter(values: Array) -> Array:
     """Return a filter (2 `NEIGHBOURS` + 1,) that gives a sample's error of interpolation from both sides."""
-    around = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
-    own, others = around[:, NEIGHBOURS], np.delete(around, NEIGHBOURS, axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
+    centre, others = windows[:, NEIGHBOURS], np.delete(windows, NEIGHBOURS, axis=1)
     square = others.T @ others
-    level = 1e-9 * float(np.trace(square)) / NEIGHBOURS + 1e-18  # simulated values may be exactly predictable
-    return np.insert(-np.linalg.solve(square + level * np.eye(2 * NEIGHBOURS), others.T @ own), NEIGHBOURS, 1.0)
+    tiny = 1e-9 * float(np.trace(square)) / NEIGHBOURS + 1e-18  # simulated values may be exactly predictable
+    return np.insert(-np.linalg.solve(square + tiny * np.eye(2 * NEIGHBOURS), others.T @ centre), NEIGHBOURS, 1.0)
 
 
 def _mean(time: Array, values: Array, seconds: float) -> Array:

@@ -140,11 +140,11 @@ def cause_of_scale(
 
     state: of a model, x (n,), P (n, n) of this recording, without day-to-day variation.
     """
-    found = scale_and_delay(model, state, parameters)
+    scale = scale_and_delay(model, state, parameters)
     is_shown = all(each.observed for each in observability(model, state.p, parameters) if each.axis == "scale")
-    if found.scale_std is None or not is_shown:
+    if scale.scale_std is None or not is_shown:
         return cause_of_setting(water)
-    return cause(water, found.scale, found.scale_std)
+    return cause(water, scale.scale, scale.scale_std)
 
 
 def cause_of_setting(water: Water | None) -> CauseOfScale | None:
@@ -167,31 +167,31 @@ def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
     if water is None or (water.speed is None and math.isnan(water.used)):
         return None
     speed, explained = water.speed, water.scale
-    found = Between(scale - 2.0 * std, scale + 2.0 * std)
+    measured = Between(scale - 2.0 * std, scale + 2.0 * std)
     parts = ["" if math.isnan(water.used) else _used(water), "" if speed is None else _of_water(water, speed)]
     text = f"Scale {100.0 * scale:+.2f} ± {200.0 * std:.2f} % (2σ): {'; '.join(filter(None, parts))}"
-    new = water.used / (1.0 + scale)
+    right_setting = water.used / (1.0 + scale)
     if speed is None:
         return CauseOfScale(
-            f"{text}. Set to {new:.1f} m/s, it would read right.",
-            f"set to {new:.1f} m/s it would read right (the DVL used {water.used:.1f})",
-            new,
+            f"{text}. Set to {right_setting:.1f} m/s, it would read right.",
+            f"set to {right_setting:.1f} m/s it would read right (the DVL used {water.used:.1f})",
+            right_setting,
         )
     if explained is None:
-        was = [each * (1.0 + end) for each, end in zip(speed, found, strict=True)]
+        was = [each * (1.0 + end) for each, end in zip(speed, measured, strict=True)]
         return CauseOfScale(
             f"{text}. The speed of sound explains the scale if the DVL was set to {was[0]:.0f} to {was[1]:.0f} m/s.",
             f"{speed.least:.1f} to {speed.most:.1f} m/s here; what the DVL used is not known",
             math.nan,
         )
-    if not explained.meets(found):
+    if not explained.meets(measured):
         return CauseOfScale(
             f"{text}. That explains {_percent(explained)}; the rest has another cause, such as beam angles or the "
-            f"reference. Set to {new:.1f} m/s, the DVL would read right in this water.",
+            f"reference. Set to {right_setting:.1f} m/s, the DVL would read right in this water.",
             f"explains {_percent(explained)} of the scale, not the rest",
-            new,
+            right_setting,
         )
-    if found.least <= 0.0 <= found.most:
+    if measured.least <= 0.0 <= measured.most:
         return CauseOfScale(
             f"{text}. The setting agrees with the scale that was found.",
             f"the DVL's {water.used:.1f} m/s agrees with the scale",
@@ -199,12 +199,12 @@ def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
         )
     condition = ""
     if math.isnan(water.salinity):
-        needed = water.salinities(Between(water.used / (1.0 + found.most), water.used / (1.0 + found.least)))
+        needed = water.salinities(Between(water.used / (1.0 + measured.most), water.used / (1.0 + measured.least)))
         condition = f" if the salinity is {needed.least:.0f} to {needed.most:.0f} PSU"
     return CauseOfScale(
-        f"{text}. That explains the scale{condition}: set the speed of sound to {new:.1f} m/s.",
-        f"{new:.1f} m/s would take the scale out (the DVL used {water.used:.1f})",
-        new,
+        f"{text}. That explains the scale{condition}: set the speed of sound to {right_setting:.1f} m/s.",
+        f"{right_setting:.1f} m/s would take the scale out (the DVL used {water.used:.1f})",
+        right_setting,
     )
 
 

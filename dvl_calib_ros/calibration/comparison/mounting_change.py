@@ -77,13 +77,13 @@ class Difference:
     def between(first: Extrinsics, second: Extrinsics) -> Difference:
         """Subtract the first from the second; a bias of the same DVL cancels."""
         compared = first.shown & second.shown
-        both = first.covariance + second.covariance
+        sum_covariance = first.covariance + second.covariance
         if first.dvl and first.dvl == second.dvl:
-            common = first.by_bias @ second.by_bias.T
-            both = both - common - common.T
-        both = both + np.diag(np.where(np.isin(_ALL, _ALL[LEVER_ARM]), ARM_WANDERS_M**2, 0.0))
+            bias_covariance = first.by_bias @ second.by_bias.T
+            sum_covariance = sum_covariance - bias_covariance - bias_covariance.T
+        sum_covariance = sum_covariance + np.diag(np.where(np.isin(_ALL, _ALL[LEVER_ARM]), ARM_WANDERS_M**2, 0.0))
         value = _near(second.value, first.value) - first.value
-        covariance = np.where(np.outer(compared, compared), both, 0.0)
+        covariance = np.where(np.outer(compared, compared), sum_covariance, 0.0)
         return Difference(first, second, np.where(compared, value, np.nan), covariance, compared)
 
     @property
@@ -102,15 +102,15 @@ class Difference:
 
     def chance(self, components: NDArray[np.intp] = _ALL) -> float:
         """Return the smallest p-value of some components; 1 if none of them is compared."""
-        at = components[self.compared[components]]
-        return float(self.p[at].min()) if len(at) else 1.0
+        compared = components[self.compared[components]]
+        return float(self.p[compared].min()) if len(compared) else 1.0
 
     def chi_square(self, components: NDArray[np.intp]) -> ChiSquare:
         """Test some components together."""
-        at = components[self.compared[components]]
-        d = self.value[at]
-        value = float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d))
-        return ChiSquare(value, len(at), chi2_sf(value, len(at)) if len(at) else math.nan)
+        compared = components[self.compared[components]]
+        difference = self.value[compared]
+        value = float(difference @ np.linalg.solve(self.covariance[np.ix_(compared, compared)], difference))
+        return ChiSquare(value, len(compared), chi2_sf(value, len(compared)) if len(compared) else math.nan)
 
 
 @dataclass(frozen=True)
@@ -204,10 +204,10 @@ def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
     """Raise InputError for a calibration that is given twice: its differences would be zero."""
     for one, other in combinations(calibrations, 2):
-        of_one, of_other = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
-        if of_one == of_other and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
+        identity, other_identity = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
+        if identity == other_identity and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
             raise InputError(
-                f"{one.name}, {other.name}: are one calibration by two names, which cannot be compared with itself"
+                f"{one.name}, {other.name}: are the same calibration, which cannot be compared with itself"
             )
 
 
@@ -225,8 +225,8 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
     pairs = [Difference.between(*two) for two in combinations(ordered, 2)]
     if not any(pair.compared[MOUNTING].any() for pair in pairs):
         raise InputError(
-            f"{', '.join(each.name for each in ordered)}: no angle that two of them have shown, so there is nothing to "
-            "compare; calibrate on more data (dvl-calib doctor says what is missing)"
+            f"{', '.join(each.name for each in ordered)}: no angle is observable in two of them, so there is nothing "
+            "to compare; calibrate on more data (dvl-calib doctor says what is missing)"
         )
     accepted = [each for each in ordered if not each.rejected]
     series = accepted or ordered
@@ -261,26 +261,26 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
         several = [replace(each, dvl="", by_bias=np.zeros_like(each.by_bias)) for each in several]
     observable = np.any([each.shown for each in several], axis=0)
     values = np.array([_near(each.value, base.value) for each in several])
-    found, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: value of the first
+    value, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: value of the first
     covariance = np.zeros((N_COMPONENTS, N_COMPONENTS))
-    own, columns = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
+    own, by_biases = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
     information, vector = own.sum(axis=0), np.einsum("nij,nj->i", own, values)
-    turned = own @ columns
+    bias_information = own @ by_biases
     for index in (group[observable[group]] for group in GROUPS):
         # bias of σ 1 as an additional state
-        across = turned[:, index].sum(axis=0)
-        of_bias = np.eye(N_AXES) + np.einsum("nia,nib->ab", columns[:, index], turned[:, index])
-        of_vector = np.einsum("nia,ni->a", turned[:, index], values[:, index])
-        share = across @ np.linalg.inv(of_bias)
-        p = np.linalg.inv(information[np.ix_(index, index)] - share @ across.T)
-        found[index], by_bias[index] = p @ (vector[index] - share @ of_vector), p @ share
+        cross_information = bias_information[:, index].sum(axis=0)
+        own_information = np.eye(N_AXES) + np.einsum("nia,nib->ab", by_biases[:, index], bias_information[:, index])
+        bias_vector = np.einsum("nia,ni->a", bias_information[:, index], values[:, index])
+        gain = cross_information @ np.linalg.inv(own_information)
+        p = np.linalg.inv(information[np.ix_(index, index)] - gain @ cross_information.T)
+        value[index], by_bias[index] = p @ (vector[index] - gain @ bias_vector), p @ gain
         covariance[np.ix_(index, index)] = p - by_bias[index] @ by_bias[index].T
     return replace(
         base,
         name=f"{len(several)} together",
         model=" ".join(dict.fromkeys(each.model for each in several)),
         last_ns=max(each.last_ns for each in several),
-        value=found,
+        value=value,
         covariance=covariance + by_bias @ by_bias.T,
         shown=observable,
         dvl=several[0].dvl,
@@ -309,16 +309,16 @@ def _changes(
 ) -> list[Change]:
     """Find changes of some components of a series, in order of time."""
 
-    def surprise(change: Change) -> tuple[float, float]:  # the ratio decides where p underflows
+    def rank(change: Change) -> tuple[float, float]:  # the ratio decides where p underflows
         ratio = np.abs(change.difference.value / change.difference.std)[components]
         return change.difference.chance(components), -float(np.nan_to_num(ratio).max())
 
     splits = _splits(series, together)
-    best = min(splits, key=surprise, default=None)
+    best = min(splits, key=rank, default=None)
     if best is None or best.difference.chance(components) >= level:
         return []
-    at = series.index(best.first_after)
-    before, after = (_changes(part, components, level, together) for part in (series[:at], series[at:]))
+    split = series.index(best.first_after)
+    before, after = (_changes(part, components, level, together) for part in (series[:split], series[split:]))
     return [*before, best, *after]
 
 
@@ -327,7 +327,7 @@ def _suspected(series: Sequence[Extrinsics], rejected: Sequence[Extrinsics]) -> 
     found = []
     for each in rejected:
         nearest = min(series, key=lambda other: abs(other.first_ns - each.first_ns))
-        first, second = sorted((nearest, each), key=lambda one: one.first_ns)
+        first, second = sorted((nearest, each), key=lambda calibration: calibration.first_ns)
         found.append(Change(Difference.between(first, second), first, second))
     return [each for each in found if each.difference.chance(MOUNTING) < SUSPICIOUS / len(rejected)]
 
@@ -381,14 +381,14 @@ def _same(comparison: Comparison) -> Reason:
         numbers = {"chi_square": scatter.value, "freedom": scatter.freedom, "p": scatter.p}
         return finding("MOUNTING_SCATTERS", count=len(comparison.calibrations), apart=math.degrees(change), **numbers)
     smallest = np.degrees(comparison.smallest)
-    seen = [f"{name} {each:.1f}°" for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(each)]
-    unseen = [name for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(each)]
+    found = [f"{name} {each:.1f}°" for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(each)]
+    not_compared = [name for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(each)]
     return finding(
         "MOUNTING_SAME",
         smallest=float(np.nanmax(smallest, initial=0.0)),
-        angles=", ".join(seen),
+        angles=", ".join(found),
         power=100.0 * POWER,
-        unseen=f"; {' and '.join(unseen)} cannot be compared" if unseen else "",
+        unseen=f"; {' and '.join(not_compared)} cannot be compared" if not_compared else "",
     )
 
 
@@ -429,15 +429,15 @@ def remarks(comparison: Comparison) -> list[Reason]:
     if len(models) > 1:
         found.append(finding("MODELS_DIFFER", models=", ".join(models)))
     assumed = [each for each in comparison.calibrations if not each.shown[LEVER_ARM].any()]
-    known = [each for each in comparison.calibrations if each.shown[LEVER_ARM].any()]
+    estimated = [each for each in comparison.calibrations if each.shown[LEVER_ARM].any()]
     for each in assumed:
-        for other in (*known, *assumed):
-            off = np.where(
-                other.shown[LEVER_ARM] | (other not in known), other.value[LEVER_ARM] - each.value[LEVER_ARM], 0.0
+        for other in (*estimated, *assumed):
+            gap = np.where(
+                other.shown[LEVER_ARM] | (other not in estimated), other.value[LEVER_ARM] - each.value[LEVER_ARM], 0.0
             )
-            if float(np.linalg.norm(off)) > ARM_MATTERS_M:
+            if float(np.linalg.norm(gap)) > ARM_MATTERS_M:
                 arm = ", ".join(f"{value:.2f}" for value in other.value[LEVER_ARM])
-                verb = "finds" if other in known else "assumes"
+                verb = "finds" if other in estimated else "assumes"
                 found.append(finding("ARMS_DIFFER", name=each.name, other=other.name, verb=verb, arm=arm))
                 break
     return found

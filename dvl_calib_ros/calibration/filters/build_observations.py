@@ -42,7 +42,7 @@ class Observer:
         if self._lever_arm is not None:
             lever = np.nan_to_num(block.attitude[:, 4:]) @ self._lever_arm  # ω×l; zero where ω is unknown
         rotation_dvl_from_body = self._parameters.rotation_dvl_from_body
-        common = (rotation_dvl_from_body, sway_heave)
+        mounting_and_prior = (rotation_dvl_from_body, sway_heave)
         interval = 1e-9 * block.interval_ns
         if needs is not Needs.REFERENCE:
             attitude = None if needs is Needs.NOTHING else np.where(block.oriented[:, None], block.attitude, _UNKNOWN)
@@ -50,7 +50,7 @@ class Observer:
                 block.velocity_dvl,
                 None,
                 lever,
-                *common,
+                *mounting_and_prior,
                 self._unaided_noise,
                 None if attitude is None else rotation_from_quaternion(attitude[:, :4]),
                 None if attitude is None else attitude[:, 4:],
@@ -63,16 +63,16 @@ class Observer:
         unmeasured = None
         if block.unmeasured.any():
             axes = (block.unmeasured[:, None] & AXIS_BITS) != 0
-            turned = np.broadcast_to(np.eye(3), (len(block), 3, 3)) if rotation is None else rotation.swapaxes(1, 2)
-            unmeasured = Unmeasured(axes, turned)
+            from_body = np.broadcast_to(np.eye(3), (len(block), 3, 3)) if rotation is None else rotation.swapaxes(1, 2)
+            unmeasured = Unmeasured(axes, from_body)
             expected = block.velocity_dvl @ rotation_dvl_from_body
             expected = expected if lever is None else expected - lever
-            reference = np.where(axes, np.einsum("nij,nj->ni", turned, expected), reference)
+            reference = np.where(axes, np.einsum("nij,nj->ni", from_body, expected), reference)
         return Observations(
             block.velocity_dvl,
             reference if rotation is None else np.einsum("nij,nj->ni", rotation, reference),
             lever,
-            *common,
+            *mounting_and_prior,
             self._paired_noise(block, rotation),
             interval=interval,
             assumptions=self._assumptions,
@@ -83,14 +83,14 @@ class Observer:
     def _paired_noise(self, block: AlignedBlock, rotation_body_from_reference: Array | None) -> Array:
         """Return R of the aided models (N or 1, 3, 3): T R_gnss Tᵀ + R_dvl where the messages give them."""
         reference = block.reference[:, 3:].reshape(-1, 3, 3)
-        given = ~np.isnan(reference[:, 0, 0])
-        if not self._parameters.use_message_covariance or not given.any():
+        is_given = ~np.isnan(reference[:, 0, 0])
+        if not self._parameters.use_message_covariance or not is_given.any():
             return self._aided_noise
         rotation = self._parameters.rotation_dvl_from_body
         rotation = rotation if rotation_body_from_reference is None else rotation @ rotation_body_from_reference
-        own = np.where(np.isnan(block.covariance), self._unaided_noise, block.covariance)
-        noise: Array = rotation @ reference @ np.swapaxes(rotation, -1, -2) + own
-        return noise if given.all() else np.where(given[:, None, None], noise, self._aided_noise)
+        dvl_noise = np.where(np.isnan(block.covariance), self._unaided_noise, block.covariance)
+        noise: Array = rotation @ reference @ np.swapaxes(rotation, -1, -2) + dvl_noise
+        return noise if is_given.all() else np.where(is_given[:, None, None], noise, self._aided_noise)
 
 
 def _reference_in_body(block: AlignedBlock) -> tuple[Array | None, Array | None]:

@@ -48,8 +48,8 @@ class FoldSums:
     def add(self, fold: int | slice, *more: Array | float) -> None:
         """Add to one fold, or to several (F, ...)."""
         self._total = None
-        for sums, own in zip(self._each, more, strict=True):
-            sums[fold] += own
+        for sums, addition in zip(self._each, more, strict=True):
+            sums[fold] += addition
 
     def of(self, fold: int) -> tuple[Array, ...]:
         """Return the sums of one fold, read-only."""
@@ -94,7 +94,7 @@ class FoldInformation:
     def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
         """Restart from Λ (K, n, n) and Λx (K, n) without each fold."""
         self._begin = known
-        self._told = FoldSums(known[0][0].shape, known[0][1].shape)
+        self._summed = FoldSums(known[0][0].shape, known[0][1].shape)
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples where models used them (K, N)."""
@@ -102,17 +102,17 @@ class FoldInformation:
         rows = np.concatenate([h, z[:, None]], axis=1).transpose(2, 1, 0, 3)  # (K, n + 1, m, N)
         weight = data.weight * used
         for fold in set(folds.tolist()):
-            at = np.flatnonzero(folds == fold)
-            some = rows.take(at, axis=3)
-            weighted = some * weight[:, None, None, at]
-            flat = (*some.shape[:2], -1)
-            added = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
-            self._told.add(fold, added[..., :-1, :-1], added[..., :-1, -1])
+            samples = np.flatnonzero(folds == fold)
+            part = rows.take(samples, axis=3)
+            weighted = part * weight[:, None, None, samples]
+            flat = (*part.shape[:2], -1)
+            information = weighted.reshape(flat) @ part.reshape(flat).swapaxes(1, 2)
+            self._summed.add(fold, information[..., :-1, :-1], information[..., :-1, -1])
 
     def without(self, fold: int) -> tuple[Array, Array]:
         """Return Λ (K, n, n) and Λx (K, n) without a fold."""
         information, vector = (
-            more + known for more, known in zip(self._told.without(fold), self._begin[fold], strict=True)
+            added + begin for added, begin in zip(self._summed.without(fold), self._begin[fold], strict=True)
         )
         return information, vector
 
@@ -127,11 +127,11 @@ class FoldInformation:
 
         start: x (K, n), P (K, n, n), prior of the reset states. of_day: (u,) indices of these states.
         """
-        known = []
+        kept = []
         for fold in range(FOLDS):
             states = zip(*(self.state(fold, index) for index in range(len(start.x))), strict=True)
-            known.append(with_states_of(GaussianState(*map(np.stack, states)), start, of_day).information)
-        self.begin(known)
+            kept.append(with_states_of(GaussianState(*map(np.stack, states)), start, of_day).information)
+        self.begin(kept)
 
 
 def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np.intp]) -> GaussianState:
@@ -155,23 +155,23 @@ class Moments(FoldSums):
     def __init__(self) -> None:
         super().__init__((), (3, 3, 3), (3, 3), (), ())
 
-    def take(self, folds: NDArray[np.int64], seen: Observations) -> None:
+    def take(self, folds: NDArray[np.int64], observations: Observations) -> None:
         """Add N samples."""
-        assert seen.reference_body is not None
-        v, g = seen.velocity_at_reference, seen.reference_body
-        measured = np.broadcast_to(seen.measured_in_body, v.shape)
-        rotation = seen.rotation_dvl_from_body
-        variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, seen.noise, rotation), v.shape)
+        assert observations.reference_body is not None
+        v, g = observations.velocity_at_reference, observations.reference_body
+        measured = np.broadcast_to(observations.measured_in_body, v.shape)
+        rotation = observations.rotation_dvl_from_body
+        variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, observations.noise, rotation), v.shape)
         for fold in set(folds.tolist()):
-            at = folds == fold
-            own, known = v[at], measured[at]
-            along = known.T[:, :, None] * own  # (3, N, 3)
-            squares, noise = np.sum(g[at] ** 2 * known), np.sum(variance[at] * known)
+            is_in_fold = folds == fold
+            velocity, is_measured = v[is_in_fold], measured[is_in_fold]
+            measured_velocity = is_measured.T[:, :, None] * velocity  # (3, N, 3)
+            squares, noise = np.sum(g[is_in_fold] ** 2 * is_measured), np.sum(variance[is_in_fold] * is_measured)
             self.add(
                 fold,
-                int(np.count_nonzero(at)),
-                along.swapaxes(1, 2) @ own,
-                (g[at].T[:, None] @ along)[:, 0],
+                int(np.count_nonzero(is_in_fold)),
+                measured_velocity.swapaxes(1, 2) @ velocity,
+                (g[is_in_fold].T[:, None] @ measured_velocity)[:, 0],
                 squares,
                 noise,
             )
@@ -222,8 +222,8 @@ def held_out_error(
         covariance = model.error_terms_from_state @ state.p @ model.error_terms_from_state.T
         uncorrected += moments.squared_error(fold, nominal)
         corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
-        _, vv, _, _, own_noise = moments.of(fold)
-        noise += float(own_noise)
+        _, vv, _, _, fold_noise = moments.of(fold)
+        noise += float(fold_noise)
         calibration += _calibration_variance(covariance, vv, nominal)
     return held_out_from_sums(samples, (uncorrected, corrected, noise + calibration, calibration))
 
@@ -236,8 +236,8 @@ def calibration_error(
     judged: the first two sums of `Moments`.
     """
     samples, vv = judged
-    of_errors = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T
-    total = _calibration_variance(of_errors, vv, rotation_dvl_from_body.T)
+    error_covariance = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T
+    total = _calibration_variance(error_covariance, vv, rotation_dvl_from_body.T)
     return math.sqrt(max(total, 0.0) / float(samples)) if samples else 0.0
 
 

@@ -89,13 +89,13 @@ def groups_of(
 
     They start from the prior, or from `initial` by model name. verified: store what `Group.states_without_folds` needs.
     """
-    alike: dict[object, list[Model]] = {}
+    by_kind: dict[object, list[Model]] = {}
     for model in models:
         of_day = tuple(model.of_day.tolist())
         rows = (model.n_state, model.n_measurement, model.noise)
         kind = (model.needs, rows, model.motion_is_noise, model.uses_height, of_day)
-        alike.setdefault(kind, []).append(model)
-    return tuple(Group(group, parameters, initial, verified) for group in alike.values())
+        by_kind.setdefault(kind, []).append(model)
+    return tuple(Group(group, parameters, initial, verified) for group in by_kind.values())
 
 
 class Group:
@@ -134,7 +134,7 @@ class Group:
         self._restarted = np.zeros(k, dtype=np.int64)
 
     def update(
-        self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
+        self, stamps_ns: Stamps, observations: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
     ) -> Snapshot | None:
         """Update by a block of N samples that meet the needs. Return the states after `ends` samples (E), if given.
 
@@ -142,35 +142,35 @@ class Group:
         """
         self.n_given += len(stamps_ns)
         if self._height is not None:
-            seen = replace(seen, height=self._height.add(stamps_ns, seen.rising))
-        data = self._assembler.measurements(seen, weight, prior_known)
+            observations = replace(observations, height=self._height.add(stamps_ns, observations.rising))
+        measurements = self._assembler.measurements(observations, weight, prior_known)
         process = self._process_noise(stamps_ns)
         cuts = np.zeros(0, dtype=np.intp)
         if self._scatter is not None:
             cuts = self._scatter.cuts(stamps_ns)
-        every = _joined_ends(cuts, ends)
-        after = self._after(data, process, every)
+        all_ends = _joined_ends(cuts, ends)
+        after = self._after(measurements, process, all_ends)
         self._x, self._p = after.x, after.p
         if self._scatter is not None and len(cuts):
-            assert every is not None and after.at is not None
-            at = np.searchsorted(every, cuts)
-            self._scatter.add(after.at.x[at], after.at.p[at])
+            assert all_ends is not None and after.at is not None
+            indices = np.searchsorted(all_ends, cuts)
+            self._scatter.add(after.at.x[indices], after.at.p[indices])
         self._states.clear()
         self._of_recording.clear()
         if self._folds is not None:
             folds = folds_of(stamps_ns, self._parameters)
-            self._folds.add(folds, data, after.used)
+            self._folds.add(folds, measurements, after.used)
             if self.needs is Needs.REFERENCE:
-                self.moments.take(folds, seen)
-        snapshot = None if ends is None or every is None else self._snapshot_at(after, ends, every)
+                self.moments.take(folds, observations)
+        snapshot = None if ends is None or all_ends is None else self._snapshot_at(after, ends, all_ends)
         n_used = after.used.sum(axis=1)
         self._used += n_used
-        self._gated += data.usable.sum(axis=1) - n_used
+        self._gated += measurements.usable.sum(axis=1) - n_used
         self._nis_sum += np.einsum("kn,kn->k", after.used, after.nis)
-        if seen.unmeasured is None:
-            self._rows_sum += n_used * data.z.shape[2]
+        if observations.unmeasured is None:
+            self._rows_sum += n_used * measurements.z.shape[2]
         else:
-            self._rows_sum += (after.used * self._assembler.rows_left(seen.unmeasured)).sum(axis=1)
+            self._rows_sum += (after.used * self._assembler.rows_left(observations.unmeasured)).sum(axis=1)
         return snapshot
 
     def end_day(self) -> None:
@@ -207,25 +207,26 @@ class Group:
         self, k: int, data: kalman.Measurements, process: Array | None, ends: Ends | None
     ) -> kalman.Updated:
         """Update the k-th model; on non-finite numbers keep its state and count a restart."""
-        own = slice(k, k + 1)
-        x, p, own_data = self._x[own], self._p[own], data.model(k)
+        only = slice(k, k + 1)
+        x, p, measurements = self._x[only], self._p[only], data.model(k)
         with suppress(np.linalg.LinAlgError):
-            after = _filtered(x, p, own_data, None if process is None else process[:, own], ends)
+            after = _filtered(x, p, measurements, None if process is None else process[:, only], ends)
             if _is_sound(after.x, after.p):
                 return after
         self._restarted[k] += 1
-        nothing = own_data.usable & False
+        unused = measurements.usable & False
         at = None if ends is None else GaussianState(np.stack([x] * len(ends)), np.stack([p] * len(ends)))
-        return kalman.Updated(x, p, nothing, nothing.astype(float), at)
+        return kalman.Updated(x, p, unused, unused.astype(float), at)
 
-    def _snapshot_at(self, after: kalman.Updated, ends: Ends, every: Ends) -> Snapshot:
-        """Return the states after `ends` samples. every: sample numbers with known states."""
+    def _snapshot_at(self, after: kalman.Updated, ends: Ends, all_ends: Ends) -> Snapshot:
+        """Return the states after `ends` samples. all_ends: sample numbers with known states."""
         states = after.at
         assert states is not None
-        at = np.searchsorted(every, ends)
+        indices = np.searchsorted(all_ends, ends)
+        # sums with a leading zero: entry n is after n samples
         used = np.cumsum(np.pad(after.used, ((0, 0), (1, 0))), axis=1)[:, ends].T
         nis = np.cumsum(np.pad(np.where(after.used, after.nis, 0.0), ((0, 0), (1, 0))), axis=1)[:, ends].T
-        return Snapshot(states.x[at], states.p[at], self._used + used, self._nis_sum + nis)
+        return Snapshot(states.x[indices], states.p[indices], self._used + used, self._nis_sum + nis)
 
     def snapshot(self, n: int) -> Snapshot:
         """Return the present states, n times."""
@@ -329,7 +330,7 @@ class BlockScatter:
         self._blocks = TimeBlocks()
         self._last: int | None = None
         self._state = GaussianState(x, p)
-        self._told = self._state.information
+        self._information = self._state.information
         self._found: dict[int, Array] = {}
 
     def cuts(self, stamps_ns: Stamps) -> Index:
@@ -345,10 +346,10 @@ class BlockScatter:
 
     def add(self, x: Array, p: Array) -> None:
         """Add the states at the cuts, x (E, K, n), P (E, K, n, n)."""
-        for now in _informations(x, p):
-            if now is not None:
-                self._blocks.add(now[0] - self._told[0], now[1] - self._told[1], 1.0)
-                self._told = now
+        for information in _informations(x, p):
+            if information is not None:
+                self._blocks.add(information[0] - self._information[0], information[1] - self._information[1], 1.0)
+                self._information = information
         self._state = GaussianState(x[-1], p[-1])
         self._found.clear()
 
@@ -358,8 +359,8 @@ class BlockScatter:
         of_day: indices (u,) of the states that differ per recording.
         """
         self.add(before.x[None], before.p[None])
-        self._blocks.end_day(of_day, *self._told, np.arange(len(before.x)))
-        self._told, self._state = after.information, after
+        self._blocks.end_day(of_day, *self._information, np.arange(len(before.x)))
+        self._information, self._state = after.information, after
         self._last = None
 
     def inflation(self, index: int) -> Array:

@@ -34,8 +34,8 @@ class Assembler:
         self._motion_is_noise = first.motion_is_noise
         priors = [prior(model, parameters) for model in self.models]
         self.prior = GaussianState(np.array([each.x for each in priors]), np.array([each.p for each in priors]))
-        begun = initial or {}
-        self._starts = [begun.get(model.name) or known for model, known in zip(self.models, priors, strict=True)]
+        given = initial or {}
+        self._starts = [given.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
         self._floors = [_floor(model, parameters) for model in self.models]
         held = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
         self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
@@ -54,23 +54,24 @@ class Assembler:
         floor = self._floors[index]
         return GaussianState(x.copy(), p.copy() if floor is None else p + floor)
 
-    def measurements(self, seen: Observations, weight: Array, prior_known: Mask) -> kalman.Measurements:
+    def measurements(self, observations: Observations, weight: Array, prior_known: Mask) -> kalman.Measurements:
         """Return the measurements of a block of N samples. weight: (N,), see `kalman.Measurements`.
 
         prior_known: (N,) bool, prior sway and heave were known; models that need them skip other samples.
         """
-        k, n_samples = len(self.models), len(seen.velocity_dvl)
+        k, n_samples = len(self.models), len(observations.velocity_dvl)
         # samples are contiguous in memory for the batch
         z = np.empty((self._m, k, n_samples)).transpose(1, 2, 0)
         h = np.zeros((self._m, self._n, k, n_samples)).transpose(2, 3, 0, 1)
         for index, model in enumerate(self.models):
-            z[index], h[index] = model.linearise(seen)
+            z[index], h[index] = model.linearise(observations)
         usable = ~self._needs_prior[:, None] | prior_known
-        noise = (seen.noise if self._model_noise is None else self._model_noise(seen))[None, :, : self._m, : self._m]
-        own_weight = (seen.motion_weight if self._motion_is_noise else weight)[None]
-        if seen.unmeasured is None:
+        noise = observations.noise if self._model_noise is None else self._model_noise(observations)
+        noise = noise[None, :, : self._m, : self._m]
+        own_weight = (observations.motion_weight if self._motion_is_noise else weight)[None]
+        if observations.unmeasured is None:
             return kalman.Measurements(z, h, noise, own_weight, usable, self._gate)
-        noise, gate = self._drop_unmeasured(z, h, noise, seen, seen.unmeasured)
+        noise, gate = self._drop_unmeasured(z, h, noise, observations, observations.unmeasured)
         return kalman.Measurements(z, h, noise, own_weight, usable, gate)
 
     def rows_left(self, unmeasured: Unmeasured) -> Array:
@@ -79,7 +80,7 @@ class Assembler:
         return self._m - np.array(dropped, dtype=float)
 
     def _drop_unmeasured(
-        self, z: Array, h: Array, noise: Array, seen: Observations, unmeasured: Unmeasured
+        self, z: Array, h: Array, noise: Array, observations: Observations, unmeasured: Unmeasured
     ) -> tuple[Array, Array]:
         """Rotate z and H to the frame of the reference and remove unmeasured rows.
 
@@ -93,7 +94,7 @@ class Assembler:
             at = np.flatnonzero(axes.any(axis=1))
             if not len(at):
                 continue
-            turned = unmeasured.rotation_reference_from_body[at] @ seen.rotation_dvl_from_body.T
+            turned = unmeasured.rotation_reference_from_body[at] @ observations.rotation_dvl_from_body.T
             kept = ~axes[at]
             z[index, at] = np.einsum("nij,nj->ni", turned, z[index, at]) * kept
             h[index, at] = turned @ h[index, at] * kept[:, :, None]

@@ -86,16 +86,16 @@ class TimeBlocks:
         if not len(of_day):
             return
         n, k = information.shape[-1], len(information)
-        within = np.linalg.inv(information[np.ix_(np.arange(k), of_day, of_day)])
+        inverse = np.linalg.inv(information[np.ix_(np.arange(k), of_day, of_day)])
         # eliminate the per-recording states: their scores vanish at the estimate
-        onto = np.broadcast_to(np.eye(n), (k, n, n)).copy()
-        onto[:, :, of_day] -= information[:, :, of_day] @ within
-        onto[:, of_day] = 0.0
-        found = (within @ vector[:, of_day, None])[..., 0]
-        for told, y in zip(*self.kept, strict=True):
-            residual = y - (told[:, :, of_day] @ found[..., None])[..., 0]
-            told[:] = onto @ told @ onto.swapaxes(1, 2)
-            y[:] = (onto @ residual[..., None])[..., 0]
+        projection = np.broadcast_to(np.eye(n), (k, n, n)).copy()
+        projection[:, :, of_day] -= information[:, :, of_day] @ inverse
+        projection[:, of_day] = 0.0
+        estimate = (inverse @ vector[:, of_day, None])[..., 0]
+        for block_information, block_vector in zip(*self.kept, strict=True):
+            residual = block_vector - (block_information[:, :, of_day] @ estimate[..., None])[..., 0]
+            block_information[:] = projection @ block_information @ projection.swapaxes(1, 2)
+            block_vector[:] = (projection @ residual[..., None])[..., 0]
         self.choose(source)
 
     def choose(self, source: NDArray[np.intp]) -> None:
@@ -146,12 +146,13 @@ def inflations(
     factor = np.ones(variance.shape)
     counts = np.array([len(each.vector) for each in blocks])
     for count in sorted(set(counts[counts >= MIN_BLOCKS].tolist())):
-        at = np.flatnonzero(counts == count)
-        scores = np.stack([blocks[number].vector - blocks[number].information @ x[number] for number in at.tolist()])
-        information = np.stack([blocks[number].information for number in at.tolist()])
+        chosen = np.flatnonzero(counts == count)
+        own = [(blocks[number], x[number]) for number in chosen.tolist()]
+        scores = np.stack([each.vector - each.information @ estimate for each, estimate in own])
+        information = np.stack([each.information for each, _ in own])
         # share of each block in the claimed variance of each quantity (S, m, r)
-        parts = np.einsum("srn,smnk,srk->smr", p[at], information, p[at], optimize=True)
-        factor[at] = _inflations(scores, parts, p[at], variance[at], lasts, rarely)
+        shares = np.einsum("srn,smnk,srk->smr", p[chosen], information, p[chosen], optimize=True)
+        factor[chosen] = _inflations(scores, shares, p[chosen], variance[chosen], lasts, rarely)
     return factor
 
 
@@ -162,17 +163,17 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
     while scores.shape[1] >= MIN_BLOCKS:
         m = scores.shape[1]
         scatter = p @ scores.swapaxes(1, 2)
-        longer = _lasting(scatter, lasts)
-        alike = effective_blocks(parts)
-        found = (scatter**2).sum(axis=2) * (alike / (alike - 1.0)) * longer
+        lasting = _lasting(scatter, lasts)
+        n_effective = effective_blocks(parts)
+        observed = (scatter**2).sum(axis=2) * (n_effective / (n_effective - 1.0)) * lasting
         by_chance = claimed * (chi2_isf(CHANCE, m - 1) / (m - 1))
-        beyond = found - claimed
+        excess = observed - claimed
         if rarely is not None:
-            surely = np.maximum(found - claimed * (chi2_isf(rarely, m - 1) / (m - 1)), 0.0)
-            beyond = beyond + surely * (student_factor(alike - 1.0) ** 2 - 1.0)
+            rare_excess = np.maximum(observed - claimed * (chi2_isf(rarely, m - 1) / (m - 1)), 0.0)
+            excess = excess + rare_excess * (student_factor(n_effective - 1.0) ** 2 - 1.0)
         # the prior part of P is not judged by the data
-        more = 1.0 + beyond / np.maximum(variance, 1e-300)
-        factor = np.maximum(factor, np.where(found > by_chance, np.sqrt(np.maximum(more, 1.0)), 1.0))
+        ratio = 1.0 + excess / np.maximum(variance, 1e-300)
+        factor = np.maximum(factor, np.where(observed > by_chance, np.sqrt(np.maximum(ratio, 1.0)), 1.0))
         scores, parts = (_paired(each) for each in (scores, parts))
     return factor
 
@@ -208,5 +209,5 @@ def _lasting(scatter: Array, lasts: float) -> Array:
         return np.ones(scatter.shape[:-1])
     correlation = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
     rho = np.clip((correlation + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MAX_CORRELATION)
-    more = (1.0 + rho) / (1.0 - rho)
-    return np.asarray(np.where(correlation > lasts / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))
+    growth = (1.0 + rho) / (1.0 - rho)
+    return np.asarray(np.where(correlation > lasts / np.sqrt(m), growth / np.maximum(1.0 - growth / m, 0.5), 1.0))

@@ -52,16 +52,16 @@ def covariance_of(information: Array, prior: Array) -> Array:
     units of the prior's diagonal, are then raised to the prior's smallest.
     """
     try:
-        found: Array = np.linalg.inv(information)
+        inverse: Array = np.linalg.inv(information)
     except np.linalg.LinAlgError:
-        found = np.zeros_like(information)
-    if not (np.diagonal(found, axis1=-2, axis2=-1) > 0.0).all():
-        unit = np.sqrt(np.diagonal(prior, axis1=-2, axis2=-1))
-        both = unit[..., None] * unit[..., None, :]
-        least = np.maximum(np.linalg.eigvalsh(prior / both)[..., :1], np.finfo(float).eps)
-        values, vectors = np.linalg.eigh(information / both)
-        found = (vectors / np.maximum(values, least)[..., None, :]) @ vectors.swapaxes(-1, -2) / both
-    return np.asarray(0.5 * (found + found.swapaxes(-1, -2)))
+        inverse = np.zeros_like(information)
+    if not (np.diagonal(inverse, axis1=-2, axis2=-1) > 0.0).all():
+        scale = np.sqrt(np.diagonal(prior, axis1=-2, axis2=-1))
+        scales = scale[..., None] * scale[..., None, :]
+        floor = np.maximum(np.linalg.eigvalsh(prior / scales)[..., :1], np.finfo(float).eps)
+        values, vectors = np.linalg.eigh(information / scales)
+        inverse = (vectors / np.maximum(values, floor)[..., None, :]) @ vectors.swapaxes(-1, -2) / scales
+    return np.asarray(0.5 * (inverse + inverse.swapaxes(-1, -2)))
 
 
 @dataclass(frozen=True)
@@ -146,17 +146,17 @@ def recursion(
     at = None
     if ends is not None:
         wanted = [[path[end] for path in paths] for end in ends.tolist()]
-        at = GaussianState(*(np.array([[state[of] for state in each] for each in wanted]) for of in range(2)))
-    x, p = (np.array([path[-1][of] for path in paths]) for of in range(2))
+        at = GaussianState(*(np.array([[state[part] for state in each] for each in wanted]) for part in range(2)))
+    x, p = (np.array([path[-1][part] for path in paths]) for part in range(2))
     return Updated(x, p, np.array(used), np.array(nis), at)
 
 
 def _recursion_of_one(
-    x: Array, p: Array, data: Measurements, k: int, process: Array | None, on_the_way: bool
+    x: Array, p: Array, data: Measurements, k: int, process: Array | None, with_path: bool
 ) -> tuple[list[GaussianState], list[bool], list[float]]:
     """Filter with the k-th model: x (n,), P (n, n), Q (N, n, n), see `recursion`.
 
-    Return the final state or, if on_the_way, the states before the first and after each sample; used flags; nis.
+    Return the final state or, if with_path, the states before the first and after each sample; used flags; nis.
     """
     n_samples, n = data.z.shape[1], len(x)
     identity = _identity(n)
@@ -176,8 +176,8 @@ def _recursion_of_one(
         nis_i = float(innovation @ _solve_definite(hpht + r_i, innovation))
         if not math.isfinite(nis_i):
             raise np.linalg.LinAlgError("the numbers have run away")
-        use = usable[i] and nis_i <= gate[i]
-        if use:
+        is_used = usable[i] and nis_i <= gate[i]
+        if is_used:
             if weight[i] != 1.0:  # the gate tests the sample at full weight; only the update uses the reduced one
                 r_i = r_i / weight[i]
             gain = _solve_definite(hpht + r_i, pht.T).T
@@ -186,11 +186,11 @@ def _recursion_of_one(
             ikh = identity - gain @ h
             p = ikh @ p @ ikh.T + gain @ r_i @ gain.T
             p = 0.5 * (p + p.T)
-        used.append(use)
+        used.append(is_used)
         nis.append(nis_i if usable[i] else 0.0)
-        if on_the_way:
+        if with_path:
             path.append(GaussianState(x, p))
-    return path if on_the_way else [GaussianState(x, p)], used, nis
+    return path if with_path else [GaussianState(x, p)], used, nis
 
 
 @cache
@@ -228,38 +228,38 @@ def batch(x: Array, p: Array, data: Measurements, ends: NDArray[np.intp] | None 
     """Filter N samples together, without process noise; the same result as `recursion`."""
     h, _ = data.whitened
     # unmeasured states change only by their correlation with measured ones
-    seen = np.flatnonzero([column.any() for column in h.swapaxes(0, 1)])
-    if not len(seen):
-        seen = np.zeros(1, dtype=np.intp)  # any state
-    solved = _solve(x[:, seen], p[:, seen[:, None], seen], data, seen)
+    measured = np.flatnonzero([column.any() for column in h.swapaxes(0, 1)])
+    if not len(measured):
+        measured = np.zeros(1, dtype=np.intp)  # any state
+    solved = _solve(x[:, measured], p[:, measured[:, None], measured], data, measured)
     if solved is None:
         return recursion(x, p, data, None, ends)
     after = solved.after(np.append([] if ends is None else ends, data.z.shape[1]).astype(np.intp))
-    if len(seen) < x.shape[1]:
-        after = _with_unseen(x, p, seen, after)
+    if len(measured) < x.shape[1]:
+        after = _with_unmeasured(x, p, measured, after)
     at = None if ends is None else GaussianState(after.x[:-1], after.p[:-1])
     return Updated(after.x[-1], after.p[-1], solved.used, solved.nis, at)
 
 
-def _with_unseen(x: Array, p: Array, seen: NDArray[np.intp], after: GaussianState) -> GaussianState:
+def _with_unmeasured(x: Array, p: Array, measured: NDArray[np.intp], after: GaussianState) -> GaussianState:
     """Return all states x (E, K, n), P (E, K, n, n) after measurements of some.
 
-    x (K, n), P (K, n, n): all states before. seen: (s,) indices of the measured ones. after: these, x (E, K, s), P (E,
-    K, s, s).
+    x (K, n), P (K, n, n): all states before. measured: (s,) indices of the measured states. after: the measured states,
+    x (E, K, s), P (E, K, s, s).
     """
-    rest = np.delete(np.arange(x.shape[1]), seen)
-    before = p[:, seen[:, None], seen]
-    gain = np.linalg.solve(before, p[:, seen[:, None], rest]).swapaxes(1, 2)  # (K, r, s)
-    of_all = np.empty((*after.x.shape[:2], x.shape[1]))
-    of_all[..., seen] = after.x
-    of_all[..., rest] = x[:, rest] + (gain @ (after.x - x[:, seen])[..., None])[..., 0]
-    covariance = np.empty((*of_all.shape, x.shape[1]))
-    across = gain @ after.p
-    covariance[..., seen[:, None], seen] = after.p
-    covariance[..., rest[:, None], seen], covariance[..., seen[:, None], rest] = across, across.swapaxes(-1, -2)
-    left = p[:, rest[:, None], rest] - gain @ (before - after.p) @ gain.swapaxes(1, 2)
-    covariance[..., rest[:, None], rest] = 0.5 * (left + left.swapaxes(-1, -2))
-    return GaussianState(of_all, covariance)
+    rest = np.delete(np.arange(x.shape[1]), measured)
+    before = p[:, measured[:, None], measured]
+    gain = np.linalg.solve(before, p[:, measured[:, None], rest]).swapaxes(1, 2)  # (K, r, s)
+    states = np.empty((*after.x.shape[:2], x.shape[1]))
+    states[..., measured] = after.x
+    states[..., rest] = x[:, rest] + (gain @ (after.x - x[:, measured])[..., None])[..., 0]
+    covariance = np.empty((*states.shape, x.shape[1]))
+    cross = gain @ after.p
+    covariance[..., measured[:, None], measured] = after.p
+    covariance[..., rest[:, None], measured], covariance[..., measured[:, None], rest] = (cross, cross.swapaxes(-1, -2))
+    conditional = p[:, rest[:, None], rest] - gain @ (before - after.p) @ gain.swapaxes(1, 2)
+    covariance[..., rest[:, None], rest] = 0.5 * (conditional + conditional.swapaxes(-1, -2))
+    return GaussianState(states, covariance)
 
 
 def least_squares(x: Array, p: Array, data: Measurements, ends: Sequence[int]) -> GaussianState:
@@ -302,11 +302,11 @@ class _Solved(NamedTuple):
         """Return x (E, K, n) and P (E, K, n, n) after these numbers of samples."""
         p = np.linalg.inv(_full([[column[:, ends].T for column in row] for row in self.information]))
         p = 0.5 * (p + p.swapaxes(-1, -2))
-        state = np.stack([column[:, ends].T for column in self.information_state], axis=-1)
-        return GaussianState((p @ state[..., None])[..., 0], p)
+        vector = np.stack([column[:, ends].T for column in self.information_state], axis=-1)
+        return GaussianState((p @ vector[..., None])[..., 0], p)
 
 
-def _solve(x: Array, p: Array, data: Measurements, seen: NDArray[np.intp]) -> _Solved | None:
+def _solve(x: Array, p: Array, data: Measurements, measured: NDArray[np.intp]) -> _Solved | None:
     """Return the information after every sample on the measured states (s,): x (K, s), P (K, s, s).
 
     The gate of a sample depends on the samples before it, so gate decisions are iterated: start with the decisions of
@@ -318,21 +318,21 @@ def _solve(x: Array, p: Array, data: Measurements, seen: NDArray[np.intp]) -> _S
     prior = np.linalg.inv(p)
     prior_state = (prior @ x[:, :, None])[:, :, 0]
     h, z = data.whitened
-    if len(seen) < h.shape[1]:
-        h = h[:, seen]
+    if len(measured) < h.shape[1]:
+        h = h[:, measured]
     wh = h if (data.weight == 1.0).all() else h * data.weight
     # a leading column for the prior, so that running sums are in place
-    room = (x.shape[0], data.z.shape[1] + 1)
-    gained = [[_gain(wh[:, i], h[:, j], room) for j in range(i + 1)] for i in range(n)]
-    gained_state = [_gain(wh[:, i], z, room) for i in range(n)]
+    shape = (x.shape[0], data.z.shape[1] + 1)
+    gains = [[_gain(wh[:, i], h[:, j], shape) for j in range(i + 1)] for i in range(n)]
+    vector_gains = [_gain(wh[:, i], z, shape) for i in range(n)]
     used = data.usable
     gated = bool(np.isfinite(data.gate).any())
     if gated:
         used = used & _passes_before(x, prior, prior_state, h, z, data.gate)
     for _ in range(MAX_GATE_PASSES):
         mask = None if used.all() else used
-        information = [[_running_sum(prior[:, i, j], gained[i][j], mask) for j in range(i + 1)] for i in range(n)]
-        information_state = [_running_sum(prior_state[:, i], gained_state[i], mask) for i in range(n)]
+        information = [[_running_sum(prior[:, i, j], gains[i][j], mask) for j in range(i + 1)] for i in range(n)]
+        information_state = [_running_sum(prior_state[:, i], vector_gains[i], mask) for i in range(n)]
         nis = _normalised_innovation_squared(
             [[column[:, :-1] for column in row] for row in information],
             [column[:, :-1] for column in information_state],

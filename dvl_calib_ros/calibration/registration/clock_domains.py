@@ -36,42 +36,40 @@ def limit_s(parameters: Parameters) -> float:
     return LONGEST_DELAY_S + parameters.position_window
 
 
-def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, late_s: float = 0.0) -> list[ArrivalOffset]:
+def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, std_s: float = 0.0) -> list[ArrivalOffset]:
     """Return the streams stamped by another clock than the rest.
 
-    ahead: stamp minus arrival time of each stream, s, up to a common offset; the DVL first. late_s: uncertainty of
+    ahead: stamp minus arrival time of each stream, s, up to a common offset; the DVL first. std_s: uncertainty of
     these values.
     """
-    offsets = {
+    configured = {
         Stream.DVL: parameters.dvl_time_offset,
         Stream.REFERENCE: parameters.reference_time_offset,
         Stream.IMU: parameters.imu_time_offset,
     }
-    corrected = {stream: seconds - offsets[stream] for stream, seconds in ahead.items()}
+    corrected = {stream: seconds - configured[stream] for stream, seconds in ahead.items()}
     if len(corrected) < 2:
         return []
     # relative to the DVL, unless the DVL is the outlier of three
-    other = next(iter(corrected))
+    base = next(iter(corrected))
     if len(corrected) > 2:
         middle = sorted(corrected.values())[1]
-        if abs(corrected[other] - middle) > limit_s(parameters):
-            other = min(corrected, key=lambda stream: abs(corrected[stream] - middle))
-    found = (
-        ArrivalOffset(stream, other, corrected[stream] - corrected[other])
-        for stream in corrected
-        if stream is not other
+        if abs(corrected[base] - middle) > limit_s(parameters):
+            base = min(corrected, key=lambda stream: abs(corrected[stream] - middle))
+    offsets = (
+        ArrivalOffset(stream, base, corrected[stream] - corrected[base]) for stream in corrected if stream is not base
     )
     # samples that are old when they are stamped have a configured delay, but no clock offset
     return [
         each
-        for each in found
-        if min(abs(each.ahead), abs(ahead[each.stream] - ahead[other])) - late_s > limit_s(parameters)
+        for each in offsets
+        if min(abs(each.ahead), abs(ahead[each.stream] - ahead[base])) - std_s > limit_s(parameters)
     ]
 
 
 SPOKEN: Mapping[Stream, str] = {Stream.DVL: "the DVL's", Stream.REFERENCE: "the reference's", Stream.IMU: "the IMU's"}
 # Offsets of known time scales from UTC, in whole seconds (since 2017).
-WELL_KNOWN = {18: "GPS time, without its leap seconds, is 18 s ahead of UTC", 37: "TAI is 37 s ahead of UTC"}
+TIME_SCALES = {18: "GPS time, without its leap seconds, is 18 s ahead of UTC", 37: "TAI is 37 s ahead of UTC"}
 
 
 # Most stamps kept per stream, evenly spread; more do not improve the median.
@@ -81,10 +79,10 @@ AT_ONCE = 64
 
 
 class StreamClocks:
-    """Stamps of each stream relative to the last DVL message before it (live: the next one)."""
+    """Stamps of reference and IMU minus the stamp of the last DVL message before them (live: of the next one)."""
 
     def __init__(self) -> None:
-        self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in (Stream.REFERENCE, Stream.IMU)}
+        self._ahead = {stream: _ThinnedValues() for stream in (Stream.REFERENCE, Stream.IMU)}
         self._newest: dict[Stream, int] = {}  # live: newest stamp by stream, and values to be added
         self._waiting: dict[Stream, list[int]] = {stream: [] for stream in self._ahead}
         self._cached: tuple[Parameters, list[Reason]] | None = None  # of all messages so far
@@ -109,10 +107,10 @@ class StreamClocks:
         self._cached = None
         dvl = _read(streams.dvl)
         for stream, block in ((Stream.REFERENCE, streams.reference), (Stream.IMU, streams.imu)):
-            other = _read(block)
-            other = other.part(other.arrival > dvl.arrival[0]) if len(dvl) else other.part(slice(0))
-            before = np.searchsorted(dvl.arrival, other.arrival) - 1
-            self._ahead[stream].add(other.stamps_ns - dvl.stamps_ns[before])
+            own = _read(block)
+            own = own.part(own.arrival > dvl.arrival[0]) if len(dvl) else own.part(slice(0))
+            last_dvl = np.searchsorted(dvl.arrival, own.arrival) - 1
+            self._ahead[stream].add(own.stamps_ns - dvl.stamps_ns[last_dvl])
 
     def objections(self, parameters: Parameters) -> list[Reason]:
         """Return findings of clock offsets beyond the range of every model."""
@@ -121,7 +119,7 @@ class StreamClocks:
         return self._cached[1]
 
     def _objections(self, parameters: Parameters) -> list[Reason]:
-        """Return a finding for each clock offset beyond `LARGEST_S`, from the order of arrival."""
+        """Return a finding for each clock offset beyond `limit_s`, from the order of arrival."""
         ahead = {Stream.DVL: 0.0}
         for stream, spread in self._ahead.items():
             self._add_waiting(stream)
@@ -129,7 +127,7 @@ class StreamClocks:
                 ahead[stream] = float(median(1e-9 * spread.kept))
         reasons = []
         for each in arrival_offset(ahead, parameters):
-            known = WELL_KNOWN.get(round(abs(each.ahead)))
+            time_scale = TIME_SCALES.get(round(abs(each.ahead)))
             reasons.append(
                 finding(
                     "CLOCKS_APART",
@@ -137,13 +135,13 @@ class StreamClocks:
                     seconds=abs(each.ahead),
                     side=each.side,
                     other=SPOKEN[each.other],
-                    known=f" ({known})" if known else "",
+                    known=f" ({time_scale})" if time_scale else "",
                 )
             )
         return reasons
 
 
-class _Spread:
+class _ThinnedValues:
     """Evenly thinned numbers, at most MOST. kept: (M,)."""
 
     def __init__(self) -> None:

@@ -66,29 +66,30 @@ class ClockChange:
         way = "ahead" if self.leap > 0.0 else "back"
         return finding("CLOCK_LEAPS", whose=whose, way=way, seconds=abs(self.leap), std=self.std, at=self.at)
 
-    def timed(self, motion: MotionStreams, fit: MotionFit, x: Array, rotation: Array, level: float) -> ClockChange:
-        """Return the step at the only matching gap in the stamps, else at the time of least total cost.
+    def timed(self, motion: MotionStreams, fit: MotionFit, state: Array, rotation: Array, level: float) -> ClockChange:
+        """Return this step with its time refined: the only matching gap in the stamps, else the time that fits best.
 
-        x: (9,) state before the step. rotation (3, 3), level (m/s): fitted by `fit` with the step corrected.
+        state: (9,) state before the step. rotation (3, 3), level (m/s): fitted by `fit` with the step corrected.
         """
         if not self.leap:
             return self
-        reach = _reach(fit.times)
-        times = stamps(motion).get(self.whose, motion.dvl.times)
-        holes = _holes(times, self.leap, self.at, reach)
-        if self.leap > 0.0 and len(holes) == 1:
-            return replace(self, at=float(times[holes[0] : holes[0] + 2].mean()))
-        after = x.copy()
-        after[[DELTA, RHO]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
-        (at, before), (later, behind) = (fit.costs(each, rotation, level) for each in (x, after))
-        shared, own, other = np.intersect1d(at, later, return_indices=True)
-        near = np.abs(fit.times[shared] - self.at) <= reach
+        reach_s = _reach(fit.times)
+        stamps_of_clock = stamps(motion).get(self.whose, motion.dvl.times)
+        gaps = _gaps_near(stamps_of_clock, self.leap, self.at, reach_s)
+        if self.leap > 0.0 and len(gaps) == 1:
+            return replace(self, at=float(stamps_of_clock[gaps[0] : gaps[0] + 2].mean()))
+        state_after = state.copy()
+        state_after[[DELTA, RHO]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
+        rows_before, costs_before = fit.costs(state, rotation, level)
+        rows_after, costs_after = fit.costs(state_after, rotation, level)
+        shared, in_before, in_after = np.intersect1d(rows_before, rows_after, return_indices=True)
+        near = np.abs(fit.times[shared] - self.at) <= reach_s
         if not near.any():
             return self
-        place = int(np.argmin(np.cumsum((before[own] - behind[other])[near])))
-        seconds = float(fit.times[shared][near][place])
+        best = int(np.argmin(np.cumsum((costs_before[in_before] - costs_after[in_after])[near])))
+        seconds = float(fit.times[shared][near][best])
         # converted to DVL stamps, midway between those before and after a forward step
-        return replace(self, at=seconds + (float(x[DELTA]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
+        return replace(self, at=seconds + (float(state[DELTA]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
 
     def corrections(self, epoch_ns: int) -> dict[str, float]:
         """Return the parameters that correct a change of the DVL clock. epoch_ns: stamp of time 0."""
@@ -100,39 +101,38 @@ class ClockChange:
 
     def corrected(self, motion: MotionStreams) -> MotionStreams:
         """Return the motion with the change corrected."""
-        m = motion
         if self.whose == "reference":
-            times, at = self._true(m.reference_times)
-            return replace(m, reference_times=times, reference=m.reference[at])
+            times, kept = self._corrected_times(motion.reference_times)
+            return replace(motion, reference_times=times, reference=motion.reference[kept])
         if self.whose == "imu":
-            times, at = self._true(m.imu.times)
-            imu = ImuColumns(times, m.imu.orientation[at], m.imu.angular_velocity[at])
-            return replace(m, imu=imu, turns=TurnRates.of(imu))
-        times, at = self._true(m.dvl.times)
-        return replace(m, dvl=DvlColumns(times, m.dvl.velocity[at]))
+            times, kept = self._corrected_times(motion.imu.times)
+            imu = ImuColumns(times, motion.imu.orientation[kept], motion.imu.angular_velocity[kept])
+            return replace(motion, imu=imu, turns=TurnRates.of(imu))
+        times, kept = self._corrected_times(motion.dvl.times)
+        return replace(motion, dvl=DvlColumns(times, motion.dvl.velocity[kept]))
 
-    def _true(self, times: Array) -> tuple[Array, Mask]:
+    def _corrected_times(self, times: Array) -> tuple[Array, Mask]:
         """Return the corrected times that increase, and their mask (N,)."""
         true = times - self.drift * times - self.leap * (times >= self.at)
-        at = np.diff(np.maximum.accumulate(true), prepend=-np.inf) > 0.0
-        return true[at], at
+        is_increasing = np.diff(np.maximum.accumulate(true), prepend=-np.inf) > 0.0
+        return true[is_increasing], is_increasing
 
 
-class _Course(NamedTuple):
-    """Hypothetical delay (S,) in each stretch per unit of the change, with a drift or a step at `at` (s).
+class _ChangePattern(NamedTuple):
+    """Hypothesis of a drift, or of a step at `at` (s; None for a drift).
 
-    kept: (S,) False for a stretch with a free delay. at: None for a drift.
+    delays: (S,) delay of each stretch per unit of the change. is_fixed: (S,) False for a stretch with a free delay.
     """
 
-    of: Array
-    kept: Mask
+    delays: Array
+    is_fixed: Mask
     at: float | None
 
-    def fits(self, value: float, stamps: Array | None, reach: float) -> bool:
+    def is_possible(self, value: float, stamps: Array | None, reach: float) -> bool:
         """Return whether stamps (N,) s allow a step of value (s); a forward step needs a gap. None: unknown stamps."""
         if self.at is None or value <= 0.0 or stamps is None:
             return True
-        return bool(len(_holes(stamps, value, self.at, reach)))
+        return bool(len(_gaps_near(stamps, value, self.at, reach)))
 
 
 def stamps(motion: MotionStreams) -> Mapping[str, Array]:
@@ -145,7 +145,7 @@ def _reach(times: Array) -> float:
     return float(np.ptp(times)) / MAX_STRETCHES + STRETCH_S
 
 
-def _holes(times: Array, jump: float, at: float, reach: float) -> Index:
+def _gaps_near(times: Array, jump: float, at: float, reach: float) -> Index:
     """Return indices of times (N,) before gaps of the size of a step (s), within reach of it."""
     gap = np.diff(times)
     return np.flatnonzero((gap > MIN_GAP_SHARE * jump) & (np.abs(times[1:] - at) < reach + gap))
@@ -156,66 +156,66 @@ def unsteady(
 ) -> ClockChange | None:
     """Return the significant change of one clock over stretches at times (S,) s, else None.
 
-    streams: stamps of each stream; a clock whose stamps have no gap has no forward step.
+    streams: stamps (N,) s by the keys of `DIRECTIONS`; a clock whose stamps have no gap has no forward step.
     """
     if len(times) < 2 * STRETCHES_A_SIDE:
         return None
     # a delay without acceleration looks like a lever arm, which is the same in all stretches
-    states = [*range(N)[ARM], DELTA, RHO]
-    seen = np.array([each.x[states] for each in stretches])
-    lags = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
+    indices = [*range(N)[ARM], DELTA, RHO]
+    states = np.array([each.x[indices] for each in stretches])
+    lag_covariance = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
     # a stretch has few time blocks, so the autocorrelation of its residuals estimates lasting noise
-    lasting = [np.maximum(each.inflation / each.raised[states], 1.0) for each in stretches]
-    p = np.array(
-        [each.p[np.ix_(states, states)] * np.outer(*[by] * 2) for each, by in zip(stretches, lasting, strict=True)]
-    )
-    weight = np.linalg.inv(p + lags)
+    noise_factors = [np.maximum(each.inflation / each.raised[indices], 1.0) for each in stretches]
+    covariances = np.array([each.p[np.ix_(indices, indices)] for each in stretches])
+    covariances *= np.array([np.outer(factor, factor) for factor in noise_factors])
+    weights = np.linalg.inv(covariances + lag_covariance)
     names = DIRECTIONS if is_turned else {"dvl": DIRECTIONS["dvl"]}
-    everywhere = np.ones(len(times), dtype=bool)
-    n = np.arange(len(times))
-    stands = np.zeros((len(times), len(states)))
-    still, *but_one = (_explained(seen, weight, stands, n != out)[0] for out in (-1, *n))
+    n, everywhere = np.arange(len(times)), np.ones(len(times), dtype=bool)
+    no_change = np.zeros((len(times), len(indices)))
+    chi2_unchanged = _fit_change(states, weights, no_change, everywhere)[0]
+    chi2_without_one = [_fit_change(states, weights, no_change, n != left_out)[0] for left_out in n]
     found = []
-    for course in (_Course(times, everywhere, None), *_leaps(times)):
+    for pattern in (_ChangePattern(times, everywhere, None), *_step_patterns(times)):
         for name, direction in names.items():
-            moved = np.outer(course.of, (0.0, 0.0, 0.0, *direction))
-            left, value, std = _explained(seen, weight, moved, course.kept)
-            left += FREE_DELAY_CHI2 * (not course.kept.all())
-            if course.fits(value, streams.get(name) if is_turned else None, _reach(times)):
-                found.append((left, value, std, name, course))
-    left, value, std, name, course = min(found, key=lambda each: each[0])
-    length = float(np.ptp(times)) if course.at is None else 1.0
+            change = np.outer(pattern.delays, (0.0, 0.0, 0.0, *direction))
+            chi2, value, std = _fit_change(states, weights, change, pattern.is_fixed)
+            chi2 += FREE_DELAY_CHI2 * (not pattern.is_fixed.all())
+            if pattern.is_possible(value, streams.get(name) if is_turned else None, _reach(times)):
+                found.append((chi2, value, std, name, pattern))
+    chi2, value, std, name, pattern = min(found, key=lambda each: each[0])
+    length = float(np.ptp(times)) if pattern.at is None else 1.0
     # noise as long as a stretch adds scatter, so all evidence is scaled down
-    scatter = max(1.0, left / (seen.size - len(states) - 1.0))
+    scatter = max(1.0, chi2 / (states.size - len(indices) - 1.0))
     std *= math.sqrt(scatter)
     is_large = abs(value) * length > REPORTED_FROM_S and abs(value) > Z_SLOW_ERRORS * std
-    is_shown = is_large and still - left > MIN_CHI2_GAIN * scatter
-    if not is_shown or left > min(but_one) + FREE_DELAY_CHI2 * scatter or scatter > MAX_CHI2_LEFT:
+    is_significant = is_large and chi2_unchanged - chi2 > MIN_CHI2_GAIN * scatter
+    is_one_bad_stretch = chi2 > min(chi2_without_one) + FREE_DELAY_CHI2 * scatter
+    if not is_significant or is_one_bad_stretch or scatter > MAX_CHI2_LEFT:
         return None
-    others = min((each[0] for each in found if each[3] != name), default=np.inf)
-    whose = name if is_turned and others - left > RULED_OUT * scatter else ""
-    return ClockChange(whose, value, std=std) if course.at is None else ClockChange(whose, 0.0, value, course.at, std)
+    chi2_other_clocks = min((cost for cost, _, _, other, _ in found if other != name), default=np.inf)
+    whose = name if is_turned and chi2_other_clocks - chi2 > RULED_OUT * scatter else ""
+    return ClockChange(whose, value, std=std) if pattern.at is None else ClockChange(whose, 0.0, value, pattern.at, std)
 
 
-def _leaps(times: Array) -> Iterator[_Course]:
+def _step_patterns(times: Array) -> Iterator[_ChangePattern]:
     """Yield steps between two stretches, and within one."""
     n = np.arange(len(times))
     for at in range(STRETCHES_A_SIDE, len(times) - STRETCHES_A_SIDE + 1):
-        yield _Course((n >= at).astype(float), n >= 0, float(times[at - 1 : at + 1].mean()))
+        yield _ChangePattern((n >= at).astype(float), n >= 0, float(times[at - 1 : at + 1].mean()))
         if at < len(times) - STRETCHES_A_SIDE:
-            yield _Course((n > at).astype(float), n != at, float(times[at]))
+            yield _ChangePattern((n > at).astype(float), n != at, float(times[at]))
 
 
-def _explained(seen: Array, weight: Array, moved: Array, kept: Mask) -> tuple[float, float, float]:
-    """Return residual chi-square, value and its σ for states (S, k): one common state plus `moved` (S, k) · value."""
-    k = seen.shape[1]
-    h = np.concatenate([np.broadcast_to(np.eye(k), (len(seen), k, k)), moved[:, :, None]], axis=2)[kept]
-    z, w = seen[kept], weight[kept]
-    information = np.einsum("sij,sik,skl->jl", h, w, h)
-    is_asked = bool(information[k, k] > 0.0)
-    n = k + is_asked
-    p = np.linalg.inv(information[:n, :n])
-    x = p @ np.einsum("sij,sik,sk->j", h, w, z)[:n]
-    residual = z - h[:, :, :n] @ x
-    chi_square = float(np.einsum("si,sij,sj->", residual, w, residual))
-    return (chi_square, float(x[k]), float(np.sqrt(p[k, k]))) if is_asked else (chi_square, 0.0, np.inf)
+def _fit_change(states: Array, weights: Array, change: Array, used: Mask) -> tuple[float, float, float]:
+    """Fit a common state plus `change` (S, k) · value to states (S, k). Return residual chi-square, value and its σ."""
+    k = states.shape[1]  # unknowns: the common state (k), then the value
+    design = np.concatenate([np.broadcast_to(np.eye(k), (len(states), k, k)), change[:, :, None]], axis=2)[used]
+    observed, used_weights = states[used], weights[used]
+    information = np.einsum("sij,sik,skl->jl", design, used_weights, design)
+    is_observable = bool(information[k, k] > 0.0)
+    n_unknowns = k + is_observable
+    p = np.linalg.inv(information[:n_unknowns, :n_unknowns])
+    estimate = p @ np.einsum("sij,sik,sk->j", design, used_weights, observed)[:n_unknowns]
+    residual = observed - design[:, :, :n_unknowns] @ estimate
+    chi_square = float(np.einsum("si,sij,sj->", residual, used_weights, residual))
+    return (chi_square, float(estimate[k]), float(np.sqrt(p[k, k]))) if is_observable else (chi_square, 0.0, np.inf)

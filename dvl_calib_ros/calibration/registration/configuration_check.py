@@ -43,15 +43,15 @@ class Directions:
 
     def add(self, velocity: Array, rotation_enu_from_body: Array) -> None:
         """Add velocities (N, 3) m/s, nominally in the body frame, and their attitudes (N, 3, 3)."""
-        along = velocity[:, 0] + 1j * velocity[:, 1]
-        ahead = rotation_enu_from_body[:, 0, 0] + 1j * rotation_enu_from_body[:, 1, 0]
-        use = (np.abs(along) > MOVING_MPS) & (np.abs(ahead) > 0.5)
-        along, ahead = along[use] / np.abs(along[use]), ahead[use] / np.abs(ahead[use])
-        self._n += len(along)
-        self._body += complex(along.sum())
-        self._enu += complex((along * ahead.conj()).sum())
-        self._ned += complex((along * ahead).sum())
-        self._heading += complex(ahead.sum())
+        travel = velocity[:, 0] + 1j * velocity[:, 1]
+        heading = rotation_enu_from_body[:, 0, 0] + 1j * rotation_enu_from_body[:, 1, 0]
+        is_clear = (np.abs(travel) > MOVING_MPS) & (np.abs(heading) > 0.5)
+        travel, heading = travel[is_clear] / np.abs(travel[is_clear]), heading[is_clear] / np.abs(heading[is_clear])
+        self._n += len(travel)
+        self._body += complex(travel.sum())
+        self._enu += complex((travel * heading.conj()).sum())
+        self._ned += complex((travel * heading).sum())
+        self._heading += complex(heading.sum())
 
     def _length(self, total: complex) -> float:
         return abs(total) / self._n if self._n >= FEWEST_OF_MOTION else math.nan
@@ -88,8 +88,9 @@ DRAWN = math.pi / 4.0
 SIGNS: Sequence[Array] = [np.array([1.0, one, other]) for one in (1.0, -1.0) for other in (1.0, -1.0)]
 SIGNS_OF_AHEAD: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
 # Largest residual of an explanation by signs, as a multiple of the registered one, whose clocks are free. In long
-# recordings it is smaller: a residual less by that factor is then enough for a delay (`LOG_GAIN`). FAR_WORSE: few rows.
-AS_WELL, FAR_WORSE = 1.1, 1.5
+# recordings it is smaller: a residual less by that factor is then enough for a delay (`LOG_GAIN`). With few rows
+# (QUICK_ROWS) it is larger.
+MAX_SIGN_RATIO, MAX_QUICK_RATIO = 1.1, 1.5
 # Smallest excess factor of one axis, above any error of the speed of sound.
 SCALED_ALONE = 0.2
 # Largest misalignment (rad) and scale error of a right configuration; a misfit (share of the speed) as large is wrong.
@@ -126,37 +127,37 @@ def fitting_configuration(
         directions.add((motion.dvl.velocity @ nominal.T)[known], rotation[known])
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
-    curves, as_given = Curves(motion), 1.0
+    curves, misfit_as_given = Curves(motion), 1.0
     if given is not None:
-        angle = _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std)
-        as_given = _with_turn(given.residual, given.scale, angle)
-    if as_given < WRONG_FROM:
+        angle = _significant_angle(given.rotation_body_from_dvl, nominal, given.turn_std)
+        misfit_as_given = _misfit_with(given.residual, given.scale, angle)
+    if misfit_as_given < WRONG_FROM:
         assert given is not None
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
-        as_well = min(AS_WELL, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
-        return wrong_axes(motion, curves, nominal, lever_arm, as_well * given.spread, parameters.dvl_axes, SIGNS)
-    found: dict[VelocityFrame, Fitted] = {}
+        max_ratio = min(MAX_SIGN_RATIO, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
+        return wrong_axes(motion, curves, nominal, lever_arm, max_ratio * given.spread, parameters.dvl_axes, SIGNS)
+    fits: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
         fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS)
         # mountings with a name, and a free one
         likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
-        of_use = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
-        each = [nearest(fit, rotation, most=of_use) for rotation in likely]
-        if (turned := each[1]) is not None and misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
+        give_up_above = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
+        candidates = [nearest(fit, rotation, most=give_up_above) for rotation in likely]
+        if (turned := candidates[1]) is not None and misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
             also_turned.add(frame)
-        if some := [one for one in each if one is not None]:
-            found[frame] = min(some, key=lambda one: one.level)
-    if not found:
+        if fitted := [each for each in candidates if each is not None]:
+            fits[frame] = min(fitted, key=lambda each: each.level)
+    if not fits:
         return None
     # of two similar fits the configured frame is likelier
-    best = min(found, key=lambda frame: found[frame].residual * (math.sqrt(0.5) if frame is declared else 1.0))
-    if found[best].residual > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
+    best = min(fits, key=lambda frame: fits[frame].residual * (math.sqrt(0.5) if frame is declared else 1.0))
+    if fits[best].residual > min(FITS_BELOW, BETTER_BY * min(misfit_as_given, 1.0)):
         return None
-    wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, parameters.dvl_axes)
+    wrong = wrong_axes(motion, curves, nominal, lever_arm, fits[best].level, parameters.dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
-    return _named(declared, best, found[best].rotation_body_from_dvl, parameters, best in also_turned)
+    return _configuration_finding(declared, best, fits[best].rotation_body_from_dvl, parameters, best in also_turned)
 
 
 def nearest(
@@ -174,25 +175,25 @@ def nearest(
     return best
 
 
-def misfit(one: Fitted, nominal: Array, residual: float | None = None) -> float:
+def misfit(fitted: Fitted, nominal: Array, residual: float | None = None) -> float:
     """Return the misfit with a mounting (3, 3) as a share of the speed; a rotation beyond misalignment counts.
 
     residual: share to use instead of the fit's own.
     """
-    turned = _shown_turn(one.rotation_body_from_dvl, nominal, one.std[TURN])
-    return _with_turn(one.residual if residual is None else residual, float(one.x[SCALE]), turned)
+    angle = _significant_angle(fitted.rotation_body_from_dvl, nominal, fitted.std[TURN])
+    return _misfit_with(fitted.residual if residual is None else residual, float(fitted.x[SCALE]), angle)
 
 
-def _shown_turn(rotation: Array, nominal: Array, std: Array) -> float:
+def _significant_angle(rotation: Array, nominal: Array, std: Array) -> float:
     """Return the significant angle (rad) between two mountings (3, 3). std: (3,) rad per body axis."""
     about = np.abs(turn_between(nominal, rotation))
     return float(np.linalg.norm(np.maximum(about - Z_ONE_TEST * std, 0.0)))
 
 
-def _with_turn(residual: float, scale: float, turned: float) -> float:
+def _misfit_with(residual: float, scale: float, angle: float) -> float:
     """Return the residual share, increased by rotation (rad) and scale if they exceed a misalignment."""
-    is_misalignment = turned < MISALIGNED and abs(scale) < SCALED
-    return residual if is_misalignment else math.hypot(residual, 2.0 * math.sin(0.5 * turned), scale)
+    is_misalignment = angle < MISALIGNED and abs(scale) < SCALED
+    return residual if is_misalignment else math.hypot(residual, 2.0 * math.sin(0.5 * angle), scale)
 
 
 def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame) -> MotionStreams:
@@ -222,11 +223,11 @@ def wrong_axes(
     found: list[tuple[float, Array, Fitted]] = []
     for pattern in patterns:
         signs = pattern[np.argsort([ahead, *others])]
-        quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), QUICK_ROWS)
-        given_up = min([FAR_ABOVE * FAR_WORSE * most, *(level for level, *_ in found)])
-        near = nearest(quick, nominal, (REFERENCE,), given_up)
+        quick_rows = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), QUICK_ROWS)
+        give_up_above = min([FAR_ABOVE * MAX_QUICK_RATIO * most, *(level for level, *_ in found)])
+        near = nearest(quick_rows, nominal, (REFERENCE,), give_up_above)
         # a fit that rotates the axes back is the configured pattern
-        if near is not None and _shown_turn(near.rotation_body_from_dvl, nominal, near.std[TURN]) < MISALIGNED:
+        if near is not None and _significant_angle(near.rotation_body_from_dvl, nominal, near.std[TURN]) < MISALIGNED:
             found.append((near.level, signs, near))
     if not found:
         return None
@@ -245,18 +246,18 @@ def wrong_axes(
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[others].any():
             mirrored, other = sorted(others, key=lambda each: not is_turned[each])
-            # in which the other axis of the same data is inverted
-            instead = None if ahead else _OTHER_AXES.get(dvl_axes)
-            alike = f" (read as {dvl_axes}; read as {instead}, {'xyz'[other]} does)" if instead else ""
+            # the same data, read in the opposite axes, have the other axis inverted
+            opposite = None if ahead else _OTHER_AXES.get(dvl_axes)
+            alike = f" (read as {dvl_axes}; read as {opposite}, {'xyz'[other]} does)" if opposite else ""
             return finding("DVL_LEFT_HANDED", axis="xyz"[mirrored], alike=alike)
         if ahead:
             return _mounting_fits(nominal @ np.diag(np.where(np.arange(3) == ahead, 1.0, -1.0)))
         return _axes_turned(nominal, dvl_axes)
-    too_small = np.where(is_shown, (factors - Z_REPEATED_TEST * std) / factors[ahead] - SCALED_ALONE, 0.0)
-    if not is_turned.any() and too_small.max() > 1.0:
-        at = int(np.argmax(too_small))
-        factor = float(factors[ahead] / factors[at])
-        return finding("DVL_AXIS_SCALED", axis="xyz"[at], factor=factor, other="xyz"[ahead])
+    excess = np.where(is_shown, (factors - Z_REPEATED_TEST * std) / factors[ahead] - SCALED_ALONE, 0.0)
+    if not is_turned.any() and excess.max() > 1.0:
+        scaled = int(np.argmax(excess))
+        factor = float(factors[ahead] / factors[scaled])
+        return finding("DVL_AXIS_SCALED", axis="xyz"[scaled], factor=factor, other="xyz"[ahead])
     return None
 
 
@@ -264,30 +265,30 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
     return replace(motion, dvl=motion.dvl._replace(velocity=motion.dvl.velocity * signs))
 
 
-def _named(
+def _configuration_finding(
     declared: VelocityFrame, best: VelocityFrame, rotation: Array, parameters: Parameters, also_turned: bool
 ) -> Reason | None:
     """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
     nominal = parameters.rotation_dvl_from_body.T
-    same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
-    if same_frame and as_given:  # a large misalignment is left to the calibration
+    same_frame, same_mounting = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
+    if same_frame and same_mounting:  # a large misalignment is left to the calibration
         return None
     body = VelocityFrame.BODY
     frame = {"name": "the body frame" if best is body else best.value.upper(), "frame": best.value}
-    earth = body not in (best, declared)
-    if as_given and earth and also_turned:
+    both_in_earth = body not in (best, declared)
+    if same_mounting and both_in_earth and also_turned:
         return finding("REFERENCE_OR_IMU_NED", **frame)
-    if as_given:  # the frame alone explains the misfit
+    if same_mounting:  # the frame alone explains the misfit
         return finding("REFERENCE_LOOKS", **frame)
-    if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
+    if not same_frame and both_in_earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
         return _imu_turned(parameters)
     if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
-        turned = _axes_turned(nominal, parameters.dvl_axes)
+        mounting_finding = _axes_turned(nominal, parameters.dvl_axes)
     else:
-        turned = _mounting_fits(_as_drawn(rotation))
+        mounting_finding = _mounting_fits(_as_drawn(rotation))
     if same_frame:
-        return turned
-    return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=turned)
+        return mounting_finding
+    return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=mounting_finding)
 
 
 def _imu_turned(parameters: Parameters) -> Reason:

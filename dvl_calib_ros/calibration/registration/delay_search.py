@@ -30,7 +30,7 @@ MIN_OVERLAP, MIN_OVERLAP_S = 0.4, 20.0
 SEPARATION_S = 2.0
 
 
-class ClockPlace(NamedTuple):
+class DelayPair(NamedTuple):
     """Candidate delays of reference and DVL relative to the IMU, s. misfit: share of the squares left."""
 
     reference: float
@@ -46,7 +46,7 @@ class _Series(NamedTuple):
     squares: Array
 
 
-def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: int = 4) -> list[ClockPlace]:
+def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None, n: int = 4) -> list[DelayPair]:
     """Return the likeliest delays by misfit, always with the best ones within 3 s.
 
     rotation_body_from_dvl: (3, 3), None if unknown. Without an attitude, or with a body-frame reference, only the
@@ -55,76 +55,77 @@ def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: in
     delays, misfit = _misfits(motion, rotation_body_from_dvl)
     by_reference = delays if misfit.shape[0] > 1 else np.zeros(1)
     near = (np.abs(by_reference)[:, None] <= 3.0) & (np.abs(delays) <= 3.0)
-    found = _minima(misfit, by_reference, delays, most)
+    found = _minima(misfit, by_reference, delays, n)
     found += _minima(np.where(near, misfit, np.inf), by_reference, delays, 1)
     return sorted(set(found), key=lambda place: place.misfit)
 
 
-def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> list[ClockPlace]:
-    """Return at most `most` lowest local minima of a misfit (R, D) over reference and DVL delays (R,) and (D,), s."""
-    around = np.pad(misfit, 1, constant_values=np.inf)  # only local minima, so that flanks of a broad one do not count
-    is_lowest = np.minimum(misfit, np.minimum(around[2:, 1:-1], around[:-2, 1:-1])) == misfit
-    is_lowest &= np.minimum(misfit, np.minimum(around[1:-1, 2:], around[1:-1, :-2])) == misfit
+def _minima(misfit: Array, by_reference: Array, by_dvl: Array, count: int) -> list[DelayPair]:
+    """Return the `count` lowest local minima of a misfit (R, D) over reference and DVL delays (R,) and (D,), s."""
+    padded = np.pad(misfit, 1, constant_values=np.inf)  # only local minima, so that flanks of a broad one do not count
+    is_lowest = np.minimum(misfit, np.minimum(padded[2:, 1:-1], padded[:-2, 1:-1])) == misfit
+    is_lowest &= np.minimum(misfit, np.minimum(padded[1:-1, 2:], padded[1:-1, :-2])) == misfit
     misfit = np.where(is_lowest, misfit, np.inf)
-    found: list[ClockPlace] = []
-    for _ in range(most):
-        r, d = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
-        if not np.isfinite(misfit[r, d]):
+    found: list[DelayPair] = []
+    for _ in range(count):
+        row, column = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
+        if not np.isfinite(misfit[row, column]):
             break
-        place = ClockPlace(float(by_reference[r]), float(by_dvl[d]), float(misfit[r, d]))
-        found.append(place)
-        near = np.abs(by_reference - place.reference)[:, None] < SEPARATION_S
-        misfit[near & (np.abs(by_dvl - place.dvl) < SEPARATION_S)] = np.inf
+        candidate = DelayPair(float(by_reference[row]), float(by_dvl[column]), float(misfit[row, column]))
+        found.append(candidate)
+        near = np.abs(by_reference - candidate.reference)[:, None] < SEPARATION_S
+        misfit[near & (np.abs(by_dvl - candidate.dvl) < SEPARATION_S)] = np.inf
     return found
 
 
 def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Array]:
     """Return delays (L,) s, and the misfit (L or 1, L) by reference delay and DVL delay."""
     step, grid = _grid(motion)
-    reach = round(FARTHEST_S / step)
-    delays = step * np.arange(-reach, reach + 1)
-    v = _on_grid(motion.dvl.times, motion.dvl.velocity, grid, step)
-    g = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
-    n = len(grid)
-    size = 1 << (n + 2 * reach - 1).bit_length()
-    of_v = np.fft.rfft(np.column_stack([v.values, v.known, v.squares]), size, axis=0)
-    least = max(MIN_OVERLAP * min(v.known.sum(), g.known.sum()), MIN_OVERLAP_S / step)
+    max_shift = round(FARTHEST_S / step)
+    delays = step * np.arange(-max_shift, max_shift + 1)
+    dvl = _on_grid(motion.dvl.times, motion.dvl.velocity, grid, step)
+    reference = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
+    n_steps = len(grid)
+    size = 1 << (n_steps + 2 * max_shift - 1).bit_length()
+    dvl_spectra = np.fft.rfft(np.column_stack([dvl.values, dvl.known, dvl.squares]), size, axis=0)
+    min_count = max(MIN_OVERLAP * min(dvl.known.sum(), reference.known.sum()), MIN_OVERLAP_S / step)
     attitude: Array | None = None
     if motion.in_earth and motion.has_attitude:
         attitude, oriented = attitude_at(motion.imu, grid, HOLE_S)
-    shifts = range(-reach, reach + 1) if attitude is not None else (0,)
+    shifts = range(-max_shift, max_shift + 1) if attitude is not None else (0,)
     misfit = np.full((len(shifts), len(delays)), np.inf)
     for row, shift in enumerate(shifts):
-        b = _shifted(g, shift)
+        body = _shifted(reference, shift)
         if attitude is not None:
-            known = b.known * oriented
-            values = np.einsum("nji,nj->ni", attitude, b.values) * known[:, None]
-            b = _Series(values, known, b.squares * known)
-        of_b = np.fft.rfft(np.column_stack([b.values, b.known, b.squares]), size, axis=0)
-        # Σ_t b(t) v(t + lag): count, squares of each where the other is known, products of all components
-        pairs = [np.conj(of_b[:, 3]) * of_v[:, 3], np.conj(of_b[:, 3]) * of_v[:, 4], np.conj(of_b[:, 4]) * of_v[:, 3]]
+            known = body.known * oriented
+            values = np.einsum("nji,nj->ni", attitude, body.values) * known[:, None]
+            body = _Series(values, known, body.squares * known)
+        conjugate = np.conj(np.fft.rfft(np.column_stack([body.values, body.known, body.squares]), size, axis=0))
+        # Σ_t body(t) dvl(t + lag): count, squares of each where the other is known, products of all components
+        products = [conjugate[:, i] * dvl_spectra[:, j] for i, j in ((3, 3), (3, 4), (4, 3))]
         if rotation is not None:
-            turned = np.conj(of_b[:, :3]) * (of_v[:, :3] @ rotation.T)
-            pairs.append(turned.sum(axis=1))
+            aligned = conjugate[:, :3] * (dvl_spectra[:, :3] @ rotation.T)
+            products.append(aligned.sum(axis=1))
         else:
-            pairs += [np.conj(of_b[:, i]) * of_v[:, j] for i in range(3) for j in range(3)]
-        sums = np.fft.irfft(np.array(pairs), size, axis=1)
-        sums = np.concatenate([sums[:, -reach:], sums[:, : reach + 1]], axis=1)
+            products += [conjugate[:, i] * dvl_spectra[:, j] for i in range(3) for j in range(3)]
+        sums = np.fft.irfft(np.array(products), size, axis=1)
+        sums = np.concatenate([sums[:, -max_shift:], sums[:, : max_shift + 1]], axis=1)
         count, squares = sums[0], sums[1] + sums[2]
         if rotation is not None:
-            alike = sums[3]
+            correlation = sums[3]
         else:
             matrices = sums[3:].T.reshape(-1, 3, 3)
-            alike = np.linalg.svd(matrices, compute_uv=False).sum(axis=1)  # either handedness will do for a search
-        enough = (count >= least) & (squares > 0.0)
-        misfit[row, enough] = (squares - 2.0 * alike)[enough] / (0.5 * squares[enough])
+            # the best orthogonal matrix: either handedness will do for a search
+            correlation = np.linalg.svd(matrices, compute_uv=False).sum(axis=1)
+        is_enough = (count >= min_count) & (squares > 0.0)
+        misfit[row, is_enough] = (squares - 2.0 * correlation)[is_enough] / (0.5 * squares[is_enough])
     return delays, np.maximum(misfit, 0.0)
 
 
 def _grid(motion: MotionStreams) -> tuple[float, Array]:
     """Return step (s) and times (N,) s of the grid over all streams, cut off for long recordings."""
     times = [motion.dvl.times, motion.reference_times]
-    start, end = min(t[0] for t in times), max(t[-1] for t in times)
+    start, end = min(stream[0] for stream in times), max(stream[-1] for stream in times)
     step = STEP_S if end - start <= MAX_SHORT_STEPS * STEP_S else LONG_STEP_S
     return step, start + step * np.arange(min(int((end - start) / step) + 1, MAX_STEPS))
 
@@ -134,14 +135,15 @@ def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
     bins = np.floor((times - grid[0]) / step)
     starts = np.flatnonzero(np.diff(bins, prepend=bins[:1] - 1.0))
     count = np.diff(np.append(starts, len(times)))
-    at = np.add.reduceat(times, starts) / count
+    mean_times = np.add.reduceat(times, starts) / count
     means = np.add.reduceat(values, starts, axis=0) / count[:, None]
-    after = np.clip(np.searchsorted(at, grid), 1, max(len(at) - 1, 1))
-    hole = max(HOLE_S, REACH_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
-    if len(at) < 2:
+    after = np.clip(np.searchsorted(mean_times, grid), 1, max(len(mean_times) - 1, 1))
+    longest_gap = max(HOLE_S, REACH_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
+    if len(mean_times) < 2:
         return _Series(np.zeros((len(grid), 3)), np.zeros(len(grid)), np.zeros(len(grid)))
-    known = ((grid >= at[0]) & (grid <= at[-1]) & (at[after] - at[after - 1] <= hole)).astype(float)
-    values = np.column_stack([np.interp(grid, at, column) for column in means.T]) * known[:, None]
+    is_near = mean_times[after] - mean_times[after - 1] <= longest_gap
+    known = ((grid >= mean_times[0]) & (grid <= mean_times[-1]) & is_near).astype(float)
+    values = np.column_stack([np.interp(grid, mean_times, column) for column in means.T]) * known[:, None]
     return _Series(values, known, (values * values).sum(axis=1))
 
 

@@ -190,8 +190,8 @@ class Readings:
         if len(self) < FEWEST_VALUES:
             return []
         known = rotation_dvl_from_body
-        likely = np.eye(3) if known is None else known
-        found = []
+        prior = np.eye(3) if known is None else known
+        results = []
         for reading in readings:
             motion = self._read(reading)
             if motion is None:
@@ -203,18 +203,18 @@ class Readings:
                 body = body + np.nan_to_num(cross(angular_velocity_at(motion.turns, self._at, GAP_S), self._position))
             dvl = self._dvl @ FLU_FROM_FRD if reading.turned else self._dvl
             speed = _rms(dvl)
-            best = best_rotation(dvl, body, likely)
+            best = best_rotation(dvl, body, prior)
             # second pass without outliers
             errors = squared(dvl - body @ best.T)
             kept = errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))]
-            best = best_rotation(dvl[kept], body[kept], likely)
+            best = best_rotation(dvl[kept], body[kept], prior)
             best_residual = _rms(dvl - body @ best.T) / speed
             residual = best_residual if known is None else _rms(dvl - body @ known.T) / speed
             travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
             is_ahead = bool(travel[1] < max(travel[0], MIN_SIDEWAYS * speed))
-            found.append(Agreement(reading, residual, best, best_residual, is_ahead))
+            results.append(Agreement(reading, residual, best, best_residual, is_ahead))
         # a small penalty prefers the smaller rotation; rounding makes ties stable (two inverted worlds fit equally)
-        return sorted(found, key=lambda each: round(each.residual + (0.02 * each.angle if known is None else 0.0), 9))
+        return sorted(results, key=lambda each: round(each.residual + (0.02 * each.angle if known is None else 0.0), 9))
 
     def registered(self, reading: Reading, rotation_dvl_from_body: Array | None) -> Registered:
         """Register a reading with free lever arm and DVL delay.
@@ -225,43 +225,43 @@ class Readings:
         (rotated about the direction of travel) look alike: the upright one is returned unless the other fits clearly
         better.
         """
-        turn = FLU_FROM_FRD if reading.turned else np.eye(3)
+        flu_from_dvl = FLU_FROM_FRD if reading.turned else np.eye(3)
         fit = self._fit(reading)
 
-        def of(rotation: Array | None) -> Registered:
+        def fitted_with(rotation: Array | None) -> Registered:
             """Return the fit for a nominal DVL rotation, or for the fitted one if None."""
-            nominal = None if rotation is None else rotation.T @ turn
-            found = nearest(fit, nominal, (REFERENCE,)) if fit else None
-            if found is None:
+            nominal = None if rotation is None else rotation.T @ flu_from_dvl
+            fitted = nearest(fit, nominal, (REFERENCE,)) if fit else None
+            if fitted is None:
                 return NOT_REGISTERED
-            residual = math.sqrt(float(_better(found.squares).mean())) / max(found.speed, 1e-9)
-            given = found.rotation_body_from_dvl if nominal is None else nominal
-            rotation_found = turn @ found.rotation_body_from_dvl.T
-            return Registered(misfit(found, given, residual), rotation_found, found.x[ARM], found.std[ARM])
+            residual = math.sqrt(float(_smallest_share(fitted.squares).mean())) / max(fitted.speed, 1e-9)
+            compared_with = fitted.rotation_body_from_dvl if nominal is None else nominal
+            rotation_found = flu_from_dvl @ fitted.rotation_body_from_dvl.T
+            return Registered(misfit(fitted, compared_with, residual), rotation_found, fitted.x[ARM], fitted.std[ARM])
 
         if rotation_dvl_from_body is not None:
-            return of(rotation_dvl_from_body)
-        best = of(None)
-        turned = of(best.rotation_dvl_from_body @ FLU_FROM_FRD)
-        upright, other = sorted((best, turned), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
+            return fitted_with(rotation_dvl_from_body)
+        best = fitted_with(None)
+        rolled = fitted_with(best.rotation_dvl_from_body @ FLU_FROM_FRD)
+        upright, other = sorted((best, rolled), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
         return other if other.residual < BETTER_BY * upright.residual else upright
 
-    def are_axes_mirrored(self, reading: Reading, found: Array, rotation_dvl_from_body: Array) -> bool:
+    def are_axes_mirrored(self, reading: Reading, rotation_found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
-        motion, turn = self._read(reading), FLU_FROM_FRD if reading.turned else np.eye(3)
-        rotated = nearest(fit, found.T @ turn, (REFERENCE,)) if (fit := self._fit(reading)) else None
+        motion, flu_from_dvl = self._read(reading), FLU_FROM_FRD if reading.turned else np.eye(3)
+        rotated = nearest(fit, rotation_found.T @ flu_from_dvl, (REFERENCE,)) if (fit := self._fit(reading)) else None
         if motion is None or rotated is None:
             return False
-        mounting = rotation_dvl_from_body.T @ turn
+        mounting = rotation_dvl_from_body.T @ flu_from_dvl
         wrong = wrong_axes(motion, Curves(motion), mounting, self._position, rotated.level, FROM_MESSAGE)
         return wrong is not None and wrong.code == "DVL_LEFT_HANDED"
 
     def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
         """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""
         travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
-        least = least_turn(rotation_dvl_from_body.T @ travel, travel)
-        is_needed = ROLL_RATIO * self.agreements([found.reading], least)[0].residual > found.best_residual
-        return rotation_dvl_from_body if is_needed else least
+        unrolled = least_turn(rotation_dvl_from_body.T @ travel, travel)
+        is_needed = ROLL_RATIO * self.agreements([found.reading], unrolled)[0].residual > found.best_residual
+        return rotation_dvl_from_body if is_needed else unrolled
 
     def is_in_body(self, found: Agreement) -> bool:
         """Return whether DVL and reference that agree in the body are not both in the earth frame."""
@@ -295,24 +295,25 @@ class Readings:
         return self._motions[key]
 
 
-def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> bool | None:
-    """Return whether turn rates of the reference are forward-right-down, by the IMU; None if unclear.
+def are_rates_frd(times: Array, reference_rates: Array, imu: ImuColumns, frame: ImuFrame) -> bool | None:
+    """Return whether turn rates of the reference agree with the IMU as forward-right-down; None if unclear.
 
-    times, own: (N,) s, (N, 3) rad/s. A left turn is positive about an axis up, negative about an axis down.
+    reference_rates: (N, 3) rad/s at times (N,) s. A left turn is positive about an axis up, negative about one down.
     """
     rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)
-    use = np.isfinite(rates).all(axis=1) & np.isfinite(own).all(axis=1)
-    rates, own = rates[use], own[use]
-    if len(own) < FEWEST_VALUES or _rms(own) < MIN_TURN_RADPS or _rms(rates) < MIN_TURN_RADPS:
+    known = np.isfinite(rates).all(axis=1) & np.isfinite(reference_rates).all(axis=1)
+    rates, reference_rates = rates[known], reference_rates[known]
+    if len(reference_rates) < FEWEST_VALUES or _rms(reference_rates) < MIN_TURN_RADPS or _rms(rates) < MIN_TURN_RADPS:
         return None
-    left, right = _rms(own - rates), _rms(own @ FLU_FROM_FRD - rates)
-    return None if min(left, right) > BETTER_BY * max(left, right) else right < left
+    misfit_flu, misfit_frd = _rms(reference_rates - rates), _rms(reference_rates @ FLU_FROM_FRD - rates)
+    is_unclear = min(misfit_flu, misfit_frd) > BETTER_BY * max(misfit_flu, misfit_frd)
+    return None if is_unclear else misfit_frd < misfit_flu
 
 
-def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
-    """Return the rotation M (3, 3) from b (N, 3) to a (N, 3), with weight PRIOR_WEIGHT on the prior `as_it_is`."""
+def best_rotation(a: Array, b: Array, prior: Array) -> Array:
+    """Return the rotation M (3, 3) from b (N, 3) to a (N, 3), with weight PRIOR_WEIGHT on the rotation `prior`."""
     square = float(squared(b).mean())
-    return nearest_rotation(a.T @ b / len(a) + PRIOR_WEIGHT * square * as_it_is)
+    return nearest_rotation(a.T @ b / len(a) + PRIOR_WEIGHT * square * prior)
 
 
 def least_turn(a: Array, b: Array) -> Array:
@@ -335,9 +336,9 @@ def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
 
 def _rms(difference: Array) -> float:
     """Return the RMS of the kept share of differences (N, 3)."""
-    return math.sqrt(float(_better(squared(difference)).mean()))
+    return math.sqrt(float(_smallest_share(squared(difference)).mean()))
 
 
-def _better(squares: Array) -> Array:
+def _smallest_share(squares: Array) -> Array:
     """Return the smallest squares (M,), outliers removed."""
     return np.sort(squares)[: max(1, int(KEPT_SHARE * len(squares)))]

@@ -179,8 +179,8 @@ class MotionFit:
 
     def __call__(
         self,
-        reference: float,
-        apart: float,
+        rho: float,
+        delta: float,
         rotation_body_from_dvl: Array | None,
         in_time: Sequence[Array] = (),
         among: Fitted | None = None,
@@ -190,37 +190,37 @@ class MotionFit:
 
         Parameters
         ----------
-        reference, apart: Initial ρ and δ, s.
+        rho, delta: Initial ρ and δ, s.
         rotation_body_from_dvl: (3, 3) prior mounting; None to estimate it.
         in_time: Rows of synchronised clocks (`DVL`, `REFERENCE`, `BOTH_ALIKE`); REFERENCE is added without an attitude.
         among: Another fit, to compare only its references, DVL samples and attitudes.
         most: Residual per axis (m/s) above which a fit that hardly improves is given up.
         """
-        rotation = self._best_rotation(reference, apart) if rotation_body_from_dvl is None else rotation_body_from_dvl
+        rotation = self._best_rotation(rho, delta) if rotation_body_from_dvl is None else rotation_body_from_dvl
         if rotation is None:
             return None
         x = np.zeros(N)
-        x[DELTA], x[RHO] = apart, reference
+        x[DELTA], x[RHO] = delta, rho
         nominal = rotation
         solved = None
         if not self.is_turned:
             in_time = (*in_time, REFERENCE)
-        left = math.inf
-        for number in range(ROUNDS):
+        previous_level = math.inf
+        for round_number in range(ROUNDS):
             rows = self._rows(x, rotation, among)
             if rows is None:
                 return None
             solved = self._solved(x, rows, nominal, rotation, in_time)
             step, _, level, _ = solved
-            if number >= FAILED_AFTER and level > max(most, MAX_LEVEL_RATIO * left):
+            if round_number >= FAILED_AFTER and level > max(most, MAX_LEVEL_RATIO * previous_level):
                 return None
-            left = level
-            far = float(np.abs(step[[DELTA, RHO]]).max())
-            step = step * min(1.0, MAX_DELAY_STEP_S / max(far, 1e-9))
+            previous_level = level
+            delay_step = float(np.abs(step[[DELTA, RHO]]).max())
+            step = step * min(1.0, MAX_DELAY_STEP_S / max(delay_step, 1e-9))
             x = x + step
             rotation = rotation_of(step[TURN]) @ rotation
             x[TURN] = 0.0
-            if far < CONVERGED_STEP and float(np.abs(step).max()) < CONVERGED_STEP:
+            if delay_step < CONVERGED_STEP and float(np.abs(step).max()) < CONVERGED_STEP:
                 break
         rows = self._rows(x, rotation, among)
         if rows is None or solved is None:
@@ -253,68 +253,69 @@ class MotionFit:
             return AxisFactors(np.ones(3), np.full(3, np.inf), fitted.level)
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_WEIGHT_Z**2 * axes * fitted.level**2))
-        own = self._axes_of_dvl(fitted, rows, rotation)
-        kept = [*range(N)[TURN], *range(N)[ARM], DELTA]
-        h = np.concatenate([own, rows.jacobian[:, :, kept]], axis=2).reshape(-1, 3 + len(kept))
-        w = np.repeat(weight, axes) / fitted.level**2
+        axis_columns = self._axes_of_dvl(fitted, rows, rotation)
+        nuisance = [*range(N)[TURN], *range(N)[ARM], DELTA]
+        design = np.concatenate([axis_columns, rows.jacobian[:, :, nuisance]], axis=2).reshape(-1, 3 + len(nuisance))
+        weights = np.repeat(weight, axes) / fitted.level**2
         from_prior = fitted.x.copy()
         from_prior[TURN], from_prior[DELTA] = turn_between(nominal, rotation), 0.0
-        prior = np.concatenate([np.full(3, FACTOR_STD**-2.0), PRIOR_STD[kept] ** -2.0])
-        information = (h * w[:, None]).T @ h + np.diag(prior)
-        vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[kept]])
-        found = np.linalg.solve(information, vector)
-        residual = rows.residual.ravel() + h @ found
+        prior = np.concatenate([np.full(3, FACTOR_STD**-2.0), PRIOR_STD[nuisance] ** -2.0])
+        weighted = (design * weights[:, None]).T
+        information = weighted @ design + np.diag(prior)
+        gradient = -weighted @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[nuisance]])
+        errors = np.linalg.solve(information, gradient)
+        residual = rows.residual.ravel() + design @ errors
         # residuals that the factors explain are no noise
-        share = float((w * residual**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
+        share = float((weights * residual**2).sum() / max((weights * rows.residual.ravel() ** 2).sum(), 1e-30))
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
-        return AxisFactors(1.0 + found[:3], std, fitted.level * math.sqrt(share))
+        return AxisFactors(1.0 + errors[:3], std, fitted.level * math.sqrt(share))
 
     def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
         """Return the derivative (J, A, 3) m/s of the residuals with respect to the axis factors."""
-        streams = self._streams(float(fitted.x[RHO]), float(fitted.x[DELTA]))
+        streams = self._interpolated(float(fitted.x[RHO]), float(fitted.x[DELTA]))
         assert streams is not None
         _, (_, _, velocity, _, attitude, _) = streams
-        own = -(1.0 + fitted.x[SCALE]) * velocity[:, None, :] * rotation
+        columns = -(1.0 + fitted.x[SCALE]) * velocity[:, None, :] * rotation
         measured = np.array(self._motion.measured)
         if measured.all():
-            return np.asarray(own)
-        return np.asarray((attitude @ own if self._motion.in_earth else own)[:, measured])
+            return np.asarray(columns)
+        return np.asarray((attitude @ columns if self._motion.in_earth else columns)[:, measured])
 
-    def _streams(self, reference: float, apart: float, among: Fitted | None = None) -> _Compared | None:
+    def _interpolated(self, rho: float, delta: float, among: Fitted | None = None) -> _Compared | None:
         """Return the compared references (J,) and their streams at delays ρ and δ, or None for too few.
 
         Streams: B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), slope noise gain (J,).
         """
         m = self._motion
-        own = self.times - reference
+        body_at = self.times - rho
         if m.in_earth and not m.has_attitude:
             return None
-        velocity, slope, gain, known = self._curves.velocity(self.times + apart)
+        velocity, slope, gain, known = self._curves.velocity(self.times + delta)
         needed = m.in_earth or not all(m.measured)
-        rotation, oriented = attitude_at(m.imu, own, GAP_S) if needed else (np.zeros((len(own), 3, 3)), known)
+        rotation, oriented = attitude_at(m.imu, body_at, GAP_S) if needed else (np.zeros((len(body_at), 3, 3)), known)
         if m.in_earth:
             known = known & oriented
         if among is not None:
-            known = known & self._shared(among, reference, apart)
+            known = known & self._shared(among, rho, delta)
         if np.count_nonzero(known) < FEWEST_SAMPLES:
             return None
-        at = np.flatnonzero(known)
-        seen, rotation = self._velocity[at], rotation[at]
-        body = np.einsum("nji,nj->ni", rotation, seen) if m.in_earth else seen
-        return at, (body, self._curves.rates(own[at]), velocity[at], slope[at], rotation, gain[at])
+        rows = np.flatnonzero(known)
+        reference_velocity, rotation = self._velocity[rows], rotation[rows]
+        body = np.einsum("nji,nj->ni", rotation, reference_velocity) if m.in_earth else reference_velocity
+        return rows, (body, self._curves.rates(body_at[rows]), velocity[rows], slope[rows], rotation, gain[rows])
 
-    def _shared(self, other: Fitted, reference: float, apart: float) -> Mask:
+    def _shared(self, other: Fitted, rho: float, delta: float) -> Mask:
         """Return a mask (J,) of references whose DVL samples and attitudes another fit compares, too."""
-        there, shared = self.times[other.at], np.zeros(len(self.times), dtype=bool)
+        other_times, shared = self.times[other.at], np.zeros(len(self.times), dtype=bool)
         shared[other.at] = True
-        for here, elsewhere in ((apart, float(other.x[DELTA])), (-reference, -float(other.x[RHO]))):
-            at = self.times + here
-            shared &= (at >= there[0] + elsewhere) & (at <= there[-1] + elsewhere)
+        for delay, other_delay in ((delta, float(other.x[DELTA])), (-rho, -float(other.x[RHO]))):
+            shifted = self.times + delay
+            shared &= (shifted >= other_times[0] + other_delay) & (shifted <= other_times[-1] + other_delay)
         return shared
 
-    def _best_rotation(self, reference: float, apart: float) -> Array | None:
+    def _best_rotation(self, rho: float, delta: float) -> Array | None:
         """Return the least-squares rotation C (3, 3) at delays ρ and δ (s), without lever arm."""
-        streams = self._streams(reference, apart)
+        streams = self._interpolated(rho, delta)
         if streams is None:
             return None
         _, (body, _, velocity, *_) = streams
@@ -323,14 +324,14 @@ class MotionFit:
 
     def _rows(self, x: Array, rotation: Array, among: Fitted | None) -> _Rows | None:
         """Linearise the residuals about a state, in the measured axes; None if too few overlap."""
-        streams = self._streams(float(x[RHO]), float(x[DELTA]), among)
+        streams = self._interpolated(float(x[RHO]), float(x[DELTA]), among)
         if streams is None:
             return None
         at, (body, rates, velocity, slope, attitude, gain) = streams
-        own = (1.0 + x[SCALE]) * velocity @ rotation.T
-        residual = body + cross(rates, self._lever_arm + x[ARM]) - own
+        dvl_in_body = (1.0 + x[SCALE]) * velocity @ rotation.T
+        residual = body + cross(rates, self._lever_arm + x[ARM]) - dvl_in_body
         jacobian = np.zeros((len(at), 3, N))
-        jacobian[:, :, TURN] = skew(own)
+        jacobian[:, :, TURN] = skew(dvl_in_body)
         jacobian[:, :, SCALE] = -velocity @ rotation.T
         jacobian[:, :, ARM] = skew(rates)
         jacobian[:, :, DELTA] = -(1.0 + x[SCALE]) * slope @ rotation.T
@@ -354,24 +355,24 @@ class MotionFit:
         """
         axes = rows.residual.shape[1]
         squares = squared(rows.residual)
-        level2 = max(float(median(squares)) / chi2_isf(0.5, axes), 1e-8)
-        weight = 1.0 / (1.0 + squares / (HALF_WEIGHT_Z**2 * axes * level2))
-        h = rows.jacobian.reshape(-1, N)
-        w = np.repeat(weight, axes) / level2
+        variance = max(float(median(squares)) / chi2_isf(0.5, axes), 1e-8)
+        weight = 1.0 / (1.0 + squares / (HALF_WEIGHT_Z**2 * axes * variance))
+        design = rows.jacobian.reshape(-1, N)
+        weights = np.repeat(weight, axes) / variance
         prior = PRIOR_STD**-2.0
-        weighted = (h * w[:, None]).T
-        information = weighted @ h + np.diag(prior)
+        weighted = (design * weights[:, None]).T
+        information = weighted @ design + np.diag(prior)
         # DVL noise in the slope counts as information on δ: subtract it, but less than the marginal information on δ
         marginal = 1.0 / float(np.linalg.inv(information)[DELTA, DELTA])
-        information[DELTA, DELTA] -= min(float(weight @ rows.of_noise) / level2, MAX_NOISE_SHARE * marginal)
+        information[DELTA, DELTA] -= min(float(weight @ rows.of_noise) / variance, MAX_NOISE_SHARE * marginal)
         from_prior = x.copy()
         from_prior[TURN] = turn_between(nominal, rotation)
         from_prior[[DELTA, RHO]] = 0.0
-        vector = -weighted @ rows.residual.ravel() - prior * from_prior
-        for row in in_time:
-            information += HELD_STD_S**-2.0 * np.outer(row, row)
-            vector -= HELD_STD_S**-2.0 * row * float(row @ x)
-        return np.linalg.solve(information, vector), information, float(np.sqrt(level2)), weight
+        gradient = -weighted @ rows.residual.ravel() - prior * from_prior
+        for constraint in in_time:
+            information += HELD_STD_S**-2.0 * np.outer(constraint, constraint)
+            gradient -= HELD_STD_S**-2.0 * constraint * float(constraint @ x)
+        return np.linalg.solve(information, gradient), information, float(np.sqrt(variance)), weight
 
 
 def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Claimed:
@@ -383,7 +384,7 @@ def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Cl
         w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
         blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
     factor = blocks.inflation(0, np.zeros(N), p, CLOCK_LASTING_Z, None)
-    inflation = max(float(factor[[DELTA, RHO]].max()), _lasting(rows.residual))
+    inflation = max(float(factor[[DELTA, RHO]].max()), _correlation_inflation(rows.residual))
     return Claimed(p * np.outer(factor, factor), inflation, factor)
 
 
@@ -401,13 +402,13 @@ def white_noise(velocity: Array) -> float:
     return float(bent.mean())
 
 
-def _lasting(residual: Array) -> float:
+def _correlation_inflation(residual: Array) -> float:
     """Return the σ factor of the mean of residuals (J, A) over white noise, by their autocorrelation."""
     n = len(residual)
     size = 1 << (2 * n - 1).bit_length()
     power = (np.abs(np.fft.rfft(residual, size, axis=0)) ** 2).sum(axis=1)
-    alike = np.fft.irfft(power, size)[: max(2, n // 8)]
-    alike = alike / max(float(alike[0]), 1e-30)
+    autocorrelation = np.fft.irfft(power, size)[: max(2, n // 8)]
+    autocorrelation = autocorrelation / max(float(autocorrelation[0]), 1e-30)
     # up to where the autocorrelation is insignificant
-    until = int(np.argmax(alike < 2.0 / np.sqrt(n))) or len(alike)
-    return float(np.sqrt(1.0 + 2.0 * alike[1:until].sum()))
+    end = int(np.argmax(autocorrelation < 2.0 / np.sqrt(n))) or len(autocorrelation)
+    return float(np.sqrt(1.0 + 2.0 * autocorrelation[1:end].sum()))

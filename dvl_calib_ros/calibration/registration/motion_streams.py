@@ -57,14 +57,14 @@ class MotionStreams:
         """True if there are attitudes to interpolate between."""
         return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
 
-    def part(self, at: Index, margin_s: float) -> MotionStreams:
+    def part(self, rows: Index, margin_s: float) -> MotionStreams:
         """Return consecutive references, with DVL and IMU samples within a margin (s) around them."""
-        times = self.reference_times[at]
-        near = (self.dvl.times >= times[0] - margin_s) & (self.dvl.times <= times[-1] + margin_s)
-        dvl = DvlColumns(self.dvl.times[near], self.dvl.velocity[near])
+        times = self.reference_times[rows]
+        is_near = (self.dvl.times >= times[0] - margin_s) & (self.dvl.times <= times[-1] + margin_s)
+        dvl = DvlColumns(self.dvl.times[is_near], self.dvl.velocity[is_near])
         first, end = np.searchsorted(self.imu.times, (times[0] - margin_s, times[-1] + margin_s)).tolist()
         imu = ImuColumns(*(column[first:end] for column in self.imu))
-        return replace(self, reference_times=times, reference=self.reference[at], dvl=dvl, imu=imu)
+        return replace(self, reference_times=times, reference=self.reference[rows], dvl=dvl, imu=imu)
 
 
 def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
@@ -84,7 +84,7 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     reference = reference.part(reference.frames == code)
     times = 1e-9 * (clocks.dvl(dvl.stamps_ns, first_ns) - first_ns)
     dvl_times, velocity = in_order(times, dvl.values)
-    reference_times, seen = in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
+    reference_times, reading = in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
     imu_times, numbers = in_order(
         1e-9 * (imu.stamps_ns - clocks.imu_ns - first_ns),
         np.hstack([unit_quaternions(imu.orientation), imu.angular_velocity]),
@@ -92,14 +92,14 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     # contiguous, because each use of a slice of wider rows would copy it
     columns = ImuColumns(imu_times, *map(np.ascontiguousarray, np.split(numbers, [4], axis=1)))
     if are_positions(parameters):
-        seen = of_moments(reference_times, seen, columns, parameters)
+        reading = of_moments(reference_times, reading, columns, parameters)
     if code == FRAME_CODES[VelocityFrame.NED]:
-        seen = seen @ ENU_FROM_NED.T
+        reading = reading @ ENU_FROM_NED.T
     measured = measured_axes(reference.values, screen_columns(reference.covariances).unmeasured, parameters.gnss_axes)
     if code == FRAME_CODES[VelocityFrame.NED]:
         measured = measured[1], measured[0], measured[2]
     made = make_motion(
-        (dvl_times, velocity), (reference_times, seen), code != FRAME_CODES[VelocityFrame.BODY], measured, columns
+        (dvl_times, velocity), (reference_times, reading), code != FRAME_CODES[VelocityFrame.BODY], measured, columns
     )
     return None if made is None else replace(made, epoch_ns=first_ns)
 
@@ -116,10 +116,11 @@ def make_motion(
     dvl, reference: increasing times (N,) s and velocities (N, 3) m/s.
     """
     times, velocity = _cleaned(*dvl)
-    reference_times, seen = _cleaned(*reference)
+    reference_times, velocities = _cleaned(*reference)
     if min(len(times), len(reference_times)) < 2 or not any(measured):
         return None
-    return MotionStreams(DvlColumns(times, velocity), reference_times, seen, in_earth, measured, imu, TurnRates.of(imu))
+    columns = DvlColumns(times, velocity)
+    return MotionStreams(columns, reference_times, velocities, in_earth, measured, imu, TurnRates.of(imu))
 
 
 def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:
@@ -183,8 +184,8 @@ class Curves:
     def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
         """Return velocity (J, 3) m/s, slope (J, 3) m/s², slope noise gain (J,) and validity at times (J,) s."""
         before, share, inside = self._places(at, self._start, len(self._grid))
-        both = _between(self._velocity, before, share)
-        return both[:, :3], both[:, 3:6], both[:, 6], inside & self._found[before] & self._found[before + 1]
+        columns = _between(self._velocity, before, share)
+        return columns[:, :3], columns[:, 3:6], columns[:, 6], inside & self._found[before] & self._found[before + 1]
 
     def rates(self, at: Array) -> Array:
         """Return angular rates (J, 3) rad/s at times (J,) s, zero where unknown."""
@@ -205,8 +206,8 @@ def _parts(n: int) -> list[slice]:
 def _between(values: Array, before: Index, share: Array) -> Array:
     """Interpolate rows linearly between index `before` and the next, at a share (0..1)."""
     before_value = values.take(before, axis=0)
-    found: Array = values.take(before + 1, axis=0)
-    found -= before_value
-    found *= share
-    found += before_value
-    return found
+    values_at: Array = values.take(before + 1, axis=0)
+    values_at -= before_value
+    values_at *= share
+    values_at += before_value
+    return values_at

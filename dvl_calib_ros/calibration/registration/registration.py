@@ -18,7 +18,7 @@ from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.tests import RULED_OUT, Z_FIFTY_TESTS
 from .clock_drift_and_jumps import MAX_STRETCHES, REPORTED_FROM_S, STRETCH_S, ClockChange, stamps, unsteady
-from .delay_search import FARTHEST_S, places
+from .delay_search import FARTHEST_S, candidate_delays
 from .gauss_newton import (  # fmt: skip
     ARM,
     BOTH_ALIKE,
@@ -201,49 +201,51 @@ def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_
 
 
 def _registered(
-    motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, moves: ClockChange | None
+    motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, change: ClockChange | None
 ) -> Registration | None:
-    """Register a motion. moves: clock change that is already corrected; None to search for one."""
+    """Register a motion. change: clock change that is already corrected; None to search for one."""
     curves = Curves(motion)
     fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (FULL_ROWS, QUICK_ROWS))
-    best = _placed(motion, quick, rotation_body_from_dvl)
+    best = _fit_at_likeliest_delays(motion, quick, rotation_body_from_dvl)
     if best is None:
         return None
-    if moves is None and best.inflation > STEADY_INFLATION:
-        moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
-        if moves is not None:
-            found = _registered(moves.corrected(motion), rotation_body_from_dvl, lever_arm, moves)
+    if change is None and best.inflation > STEADY_INFLATION:
+        change = _change(motion, curves, lever_arm, rotation_body_from_dvl)
+        if change is not None:
+            found = _registered(change.corrected(motion), rotation_body_from_dvl, lever_arm, change)
             # several delays fit each stretch in waves; a real clock change lowers the total residual
             if found is not None and found.spread < best.level:
-                x = np.zeros(N)
-                x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
-                x[DELTA], x[RHO] = found.dvl.delay_s - found.reference.delay_s, found.reference.delay_s
-                return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
-    in_time = _held(quick, best, rotation_body_from_dvl)
-    if in_time[1] < IN_SYNC_CHI2:  # the full fit would add no evidence
-        seen = _explained(quick, best, in_time, rotation_body_from_dvl, lever_arm)
-        if not seen.left_open.any():
-            return seen
+                state = np.zeros(N)
+                state[SCALE], state[ARM] = found.scale, found.lever_arm - lever_arm
+                state[DELTA], state[RHO] = found.dvl.delay_s - found.reference.delay_s, found.reference.delay_s
+                change = change.timed(motion, fit, state, found.rotation_body_from_dvl, found.spread)
+                return replace(found, unsteady=change)
+    synchronised = _fit_in_sync(quick, best, rotation_body_from_dvl)
+    if synchronised[1] < IN_SYNC_CHI2:  # the full fit would add no evidence
+        explained = _fewest_delayed_clocks(quick, best, synchronised, rotation_body_from_dvl, lever_arm)
+        if not explained.left_open.any():
+            return explained
         # more references determine the reference clock better
         free = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
         if free is None or not _is_possible(free):
-            return seen
-        if _held(fit, free, rotation_body_from_dvl)[1] < IN_SYNC_CHI2:
-            return replace(seen, **_open(fit, free, 0.0, rotation_body_from_dvl))
+            return explained
+        if _fit_in_sync(fit, free, rotation_body_from_dvl)[1] < IN_SYNC_CHI2:
+            return replace(explained, **_reference_clock(fit, free, 0.0, rotation_body_from_dvl))
         best = free
     best = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
     if best is None or not _is_possible(best):
         return None
-    return _explained(fit, best, _held(fit, best, rotation_body_from_dvl), rotation_body_from_dvl, lever_arm)
+    synchronised = _fit_in_sync(fit, best, rotation_body_from_dvl)
+    return _fewest_delayed_clocks(fit, best, synchronised, rotation_body_from_dvl, lever_arm)
 
 
-def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> Fitted | None:
+def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> Fitted | None:
     """Return the fit at the likeliest delays of a motion."""
-    likely = places(motion, rotation)
-    enough = MISFIT_LIMIT[0] * likely[0].misfit + MISFIT_LIMIT[1] if likely else 0.0
-    tried = [(place.reference, place.dvl - place.reference) for place in likely if place.misfit <= enough]
-    found = [quick(*place, rotation) for place in {*tried, (0.0, 0.0)}]
-    fitted = [each for each in found if each is not None and _is_possible(each)]
+    candidates = candidate_delays(motion, rotation)
+    max_misfit = MISFIT_LIMIT[0] * candidates[0].misfit + MISFIT_LIMIT[1] if candidates else 0.0
+    delays = [(each.reference, each.dvl - each.reference) for each in candidates if each.misfit <= max_misfit]
+    fits = [quick(*rho_and_delta, rotation) for rho_and_delta in {*delays, (0.0, 0.0)}]
+    fitted = [each for each in fits if each is not None and _is_possible(each)]
     if not fitted:
         return None
     closest = min(fitted, key=lambda each: each.level)
@@ -252,49 +254,49 @@ def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> 
     return min(as_good, key=lambda each: abs(each.x[RHO]) + abs(each.dvl_delay_s))
 
 
-def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
+def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
     """Return the clock drift or step between the stretches of a motion, or None."""
     times = motion.reference_times
-    number = min(int((times[-1] - times[0]) / STRETCH_S), MAX_STRETCHES)
+    n_stretches = min(int((times[-1] - times[0]) / STRETCH_S), MAX_STRETCHES)
     found = []
-    for at in np.array_split(np.arange(len(times)), max(number, 1)) if number > 1 else ():
-        own = motion.part(at, FARTHEST_S)
-        best = _placed(own, MotionFit(own, lever_arm, curves, ROWS_OF_STRETCH), rotation)
+    for rows in np.array_split(np.arange(len(times)), max(n_stretches, 1)) if n_stretches > 1 else ():
+        stretch = motion.part(rows, FARTHEST_S)
+        best = _fit_at_likeliest_delays(stretch, MotionFit(stretch, lever_arm, curves, ROWS_OF_STRETCH), rotation)
         if best is not None:
-            found.append((float(times[at].mean()), best))
+            found.append((float(times[rows].mean()), best))
     is_turned = motion.in_earth and motion.has_attitude
-    return unsteady(np.array([at for at, _ in found]), [each for _, each in found], is_turned, stamps(motion))
+    return unsteady(np.array([mean for mean, _ in found]), [best for _, best in found], is_turned, stamps(motion))
 
 
-def _explained(
-    fit: MotionFit, free: Fitted, in_time: tuple[Fitted | None, float], rotation: Array | None, lever_arm: Array
+def _fewest_delayed_clocks(
+    fit: MotionFit, free: Fitted, synchronised: tuple[Fitted | None, float], rotation: Array | None, lever_arm: Array
 ) -> Registration:
-    """Explain a fit by the fewest delayed clocks: none (in_time, see `_held`), one of three, or DVL and reference."""
-    apart = float(free.x[DELTA])
-    early, too_early = (EARLY_PENALTY, 0.0) if apart < 0.0 else (0.0, EARLY_PENALTY)
-    tried = {_Off.NONE: in_time}
-    if tried[_Off.NONE][1] >= IN_SYNC_CHI2:
+    """Explain a fit with free delays by the fewest delayed clocks: none (synchronised), one of three, or two."""
+    delta = float(free.x[DELTA])
+    dvl_penalty, ref_penalty = (EARLY_PENALTY, 0.0) if delta < 0.0 else (0.0, EARLY_PENALTY)
+    tried = {_Delayed.NONE: synchronised}
+    if tried[_Delayed.NONE][1] >= IN_SYNC_CHI2:
         tried |= {
-            _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), GAIN_PER_CLOCK + early),
-            _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), GAIN_PER_CLOCK + too_early),
-            _Off.IMU: _held(fit, free, rotation, float(free.x[RHO]), 0.0, (BOTH_ALIKE,), GAIN_PER_CLOCK),
+            _Delayed.DVL: _fit_in_sync(fit, free, rotation, 0.0, delta, (REFERENCE,), GAIN_PER_CLOCK + dvl_penalty),
+            _Delayed.REFERENCE: _fit_in_sync(fit, free, rotation, -delta, delta, (DVL,), GAIN_PER_CLOCK + ref_penalty),
+            _Delayed.IMU: _fit_in_sync(fit, free, rotation, float(free.x[RHO]), 0.0, (BOTH_ALIKE,), GAIN_PER_CLOCK),
         }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
     # BOTH includes every other explanation, so it is no alternative
-    next_worse = min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost
+    next_worse = min((worse for each, (_, worse) in tried.items() if each is not likeliest), default=math.inf) - cost
     if best is None or cost > 2.0 * GAIN_PER_CLOCK:
-        likeliest, best, next_worse = _Off.BOTH, free, math.inf
+        likeliest, best, next_worse = _Delayed.BOTH, free, math.inf
     is_identified = next_worse > RULED_OUT
     x, p = best.x, best.p
     # an insignificant delay is set to zero, and σ must cover it
-    stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_identified and _is_off(best, RHO))
-    delay_s = 0.0 if stays else float(x[RHO])
+    is_ref_held = likeliest in (_Delayed.NONE, _Delayed.DVL) or not (is_identified and _is_off(best, RHO))
+    delay_s = 0.0 if is_ref_held else float(x[RHO])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     return Registration(
         dvl=Clock(best.dvl_delay_s, best.dvl_std, is_identified and is_beyond_doubt(best.dvl_delay_s, best.dvl_std)),
         reference=Clock(float(x[RHO]), float(std[RHO]), is_identified and _is_off(best, RHO)),
-        imu=Clock(-float(x[RHO]), float(std[RHO]), likeliest is _Off.IMU and is_identified and _is_off(best, RHO)),
-        apart=Clock(float(x[DELTA]), float(std[DELTA]), likeliest is not _Off.NONE and _is_off(best, DELTA)),
+        imu=Clock(-float(x[RHO]), float(std[RHO]), likeliest is _Delayed.IMU and is_identified and _is_off(best, RHO)),
+        apart=Clock(float(x[DELTA]), float(std[DELTA]), likeliest is not _Delayed.NONE and _is_off(best, DELTA)),
         is_turned=fit.is_turned,
         are_known=bool((free.std[[DELTA, RHO] if fit.is_turned else [DELTA]] < KNOWN_STD_S).all()),
         rotation_body_from_dvl=best.rotation_body_from_dvl,
@@ -307,21 +309,22 @@ def _explained(
         spread=best.level,
         speed=best.speed,
         next_worse=next_worse,
-        **_open(fit, free, delay_s, rotation),
+        **_reference_clock(fit, free, delay_s, rotation),
     )
 
 
-def _open(fit: MotionFit, free: Fitted, delay_s: float, rotation: Array | None) -> dict[str, Any]:
+def _reference_clock(fit: MotionFit, free: Fitted, delay_s: float, rotation: Array | None) -> dict[str, Any]:
     """Return open_std_s and open_by of a fit with free clocks. delay_s: adopted reference delay, s."""
     if not fit.is_turned:
         return {"open_std_s": 0.0, "open_by": np.zeros(7)}
-    std, by, off = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
-    if off > OPEN_Z * std and delay_s == 0.0:
-        std = off
-    if off > OPEN_Z * PRIOR_DELAY_STD_S and delay_s == 0.0:
+    # by: sensitivity of all states to the reference delay
+    std, by, offset = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
+    if offset > OPEN_Z * std and delay_s == 0.0:
+        std = offset
+    if offset > OPEN_Z * PRIOR_DELAY_STD_S and delay_s == 0.0:
         # the free delay is so large that its sensitivities do not hold at zero delay
-        near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / PRIOR_DELAY_STD_S),))
-        std, by = max(std, off), by if near is None else near.by(RHO)
+        prior_fit = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / PRIOR_DELAY_STD_S),))
+        std, by = max(std, offset), by if prior_fit is None else prior_fit.by(RHO)
     return {"open_std_s": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[DELTA]]])}
 
 
@@ -330,26 +333,26 @@ def _with_prior(std: float) -> float:
     return 1.0 / math.hypot(1.0 / max(std, 1e-9), 1.0 / PRIOR_DELAY_STD_S)
 
 
-class _Off(Enum):
+class _Delayed(Enum):
     """Delayed clock."""
 
     NONE, DVL, REFERENCE, IMU, BOTH = range(5)
 
 
-def _held(
+def _fit_in_sync(
     fit: MotionFit,
     free: Fitted,
     rotation: Array | None,
-    reference: float = 0.0,
-    apart: float = 0.0,
-    in_time: tuple[Array, ...] = (DVL, REFERENCE),
+    rho: float = 0.0,
+    delta: float = 0.0,
+    held_clocks: tuple[Array, ...] = (DVL, REFERENCE),
     costs: float = 0.0,
 ) -> tuple[Fitted | None, float]:
     """Fit with some or all clocks synchronised. Return the fit and its chi-square growth plus `costs`.
 
-    in_time: rows that select the synchronised clocks. Without a possible fit: None and infinity.
+    held_clocks: rows that select the synchronised clocks. Without a possible fit: None and infinity.
     """
-    held = fit(reference, apart, rotation, in_time)
+    held = fit(rho, delta, rotation, held_clocks)
     if held is None or not _is_possible(held):
         return None, math.inf
     # the number of compared samples depends on the delays
@@ -378,40 +381,40 @@ def _way(clock: Clock) -> str:
     return "late" if clock.delay_s > 0.0 else "early"
 
 
-def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
+def _is_as_good(motion: MotionStreams, fit: MotionFit, other: Fitted, closest: Fitted, rotation: Array | None) -> bool:
     """Return whether a candidate fits about as well as the one with the smallest residual, on the same data.
 
     A delay may lower the residual by moving a bad DVL stretch out of the overlap. Candidates with other DVL delays also
     sample other DVL noise; in periodic waves this alone makes a difference.
     """
-    is_read_elsewhere = abs(float(one.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
-    enough = LOG_GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
-    if _gain(motion, one, closest) < enough:
+    is_read_elsewhere = abs(float(other.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
+    chance_gain = LOG_GAIN + (_chance_gain_std(motion, other, fit.dvl_noise) if is_read_elsewhere else 0.0)
+    if _gain(motion, other, closest) < chance_gain:
         return True
-    if closest.rows > MIN_ROW_SHARE * one.rows:
+    if closest.rows > MIN_ROW_SHARE * other.rows:
         return False
-    again = fit(float(one.x[RHO]), float(one.x[DELTA]), rotation, (), closest)
-    if again is None:
+    refitted = fit(float(other.x[RHO]), float(other.x[DELTA]), rotation, (), closest)
+    if refitted is None:
         return False
-    grown = again.cost(closest.level, again.at) - closest.cost(closest.level, again.at)
-    return 0.5 * grown * min(1.0, _independent(motion, again) / again.rows) < enough
+    grown = refitted.cost(closest.level, refitted.at) - closest.cost(closest.level, refitted.at)
+    return 0.5 * grown * min(1.0, _independent_rows(motion, refitted) / refitted.rows) < chance_gain
 
 
-def _by_chance(motion: MotionStreams, fitted: Fitted, dvl_noise: float) -> float:
+def _chance_gain_std(motion: MotionStreams, fitted: Fitted, dvl_noise: float) -> float:
     """Return σ of the log-evidence difference of two candidates that sample different DVL noise."""
     share = min(dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of the residual variance
     # variance of (g + a)² - (g + b)² in units of the residual variance: g reference noise, a and b DVL noise
     each = 8.0 * share * (1.0 - share) + 4.0 * share**2
     samples = fitted.rows * fitted.axes
-    return 0.5 * math.sqrt(each * samples) * min(1.0, _independent(motion, fitted) / fitted.rows)
+    return 0.5 * math.sqrt(each * samples) * min(1.0, _independent_rows(motion, fitted) / fitted.rows)
 
 
 def _gain(motion: MotionStreams, one: Fitted, other: Fitted) -> float:
     """Return the log-evidence gain of the second fit over the first, counting independent samples."""
-    return 3.0 * _independent(motion, other) * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
+    return 3.0 * _independent_rows(motion, other) * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
 
 
-def _independent(motion: MotionStreams, fitted: Fitted) -> float:
+def _independent_rows(motion: MotionStreams, fitted: Fitted) -> float:
     """Return the number of independent references among the compared ones."""
     times = motion.reference_times
     return min(float(fitted.rows), float(times[-1] - times[0]) / INDEPENDENT_S)

@@ -57,27 +57,29 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
     dvl_times, velocity = motion.dvl
     body = velocity @ rotation_dvl_from_body
     reference_times, reference = motion.reference_times, motion.reference
-    own, others = _steps(dvl_times), _steps(reference_times)
-    known, is_own = (covered(t, at).astype(float) for t, at in ((reference_times, others), (dvl_times, own)))
-    late, is_far = lag(
-        _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0], known, is_own
-    )
+
+    known = (covered(reference_times, _steps(reference_times)), covered(dvl_times, _steps(dvl_times)))
+    speeds = _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0]
+    delay_s, is_far = lag(*speeds, *(mask.astype(float) for mask in known))
     if is_far:
-        return UnregistrableClocks("the DVL's", "the reference's", late)
+        return UnregistrableClocks("the DVL's", "the reference's", delay_s)
     if not motion.in_earth or not motion.has_attitude:
         return None
-    at = np.arange(max(dvl_times[0] - late, reference_times[0]), min(dvl_times[-1] - late, reference_times[-1]), STEP_S)
-    if not len(at):
+    synchronised_times = dvl_times - delay_s
+    start, end = max(synchronised_times[0], reference_times[0]), min(synchronised_times[-1], reference_times[-1])
+    shared_grid = np.arange(start, end, STEP_S)
+    if not len(shared_grid):
         return None
-    course: Series = (velocity_at(reference_times, reference, at)[:, :2] @ [1.0, 1j]) * np.conj(
-        velocity_at(dvl_times, body, at + late)[:, :2] @ [1.0, 1j]
+    # direction over ground relative to the direction in the body: the heading without the IMU
+    heading: Series = (velocity_at(reference_times, reference, shared_grid)[:, :2] @ [1.0, 1j]) * np.conj(
+        velocity_at(dvl_times, body, shared_grid + delay_s)[:, :2] @ [1.0, 1j]
     )
-    turned = _steps(motion.imu.times)
-    rotation, _ = attitude_at(motion.imu, turned, HOLE_S)
-    ahead: Series = rotation[:, :2, 0] @ [1.0, 1j]
-    moving = ((np.abs(course) > MOVING_MPS**2) & covered(reference_times, at)).astype(float)
-    late, is_far = lag(_unit(ahead), motion.imu.times[0], _unit(course), at[0], moving)
-    return UnregistrableClocks("the IMU's", "those of DVL and reference", late) if is_far else None
+    imu_grid = _steps(motion.imu.times)
+    rotation, _ = attitude_at(motion.imu, imu_grid, HOLE_S)
+    imu_heading: Series = rotation[:, :2, 0] @ [1.0, 1j]
+    moving = ((np.abs(heading) > MOVING_MPS**2) & covered(reference_times, shared_grid)).astype(float)
+    delay_s, is_far = lag(_unit(imu_heading), motion.imu.times[0], _unit(heading), shared_grid[0], moving)
+    return UnregistrableClocks("the IMU's", "those of DVL and reference", delay_s) if is_far else None
 
 
 def _without_long_pauses(motion: MotionStreams) -> MotionStreams:
@@ -85,17 +87,17 @@ def _without_long_pauses(motion: MotionStreams) -> MotionStreams:
     streams = motion.dvl.times, motion.reference_times, motion.imu.times
     every = np.sort(np.concatenate(streams))
     most = max(LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE * STEP_S * len(every))
-    if not len(every) or max(own[-1] - own[0] for own in streams if len(own)) <= most:
+    if not len(every) or max(times[-1] - times[0] for times in streams if len(times)) <= most:
         return motion
     gaps = np.diff(every)
     # only pauses within all streams: the offset between two clocks must remain
-    is_pause = np.any([(own[0] <= every[:-1]) & (own[-1] >= every[1:]) for own in streams if len(own)], axis=0)
+    is_pause = np.any([(times[0] <= every[:-1]) & (times[-1] >= every[1:]) for times in streams if len(times)], axis=0)
     cut = np.zeros(len(gaps))
     cut[is_pause] = gaps[is_pause] - shortened(gaps[is_pause], most)
-    removed = np.append(0.0, np.cumsum(cut))
-    first = np.maximum.accumulate(np.where(np.append(True, ~is_pause), np.arange(len(every)), 0))
-    moved = every - (removed - removed[first])
-    dvl, reference, imu = (np.interp(own, every, moved) for own in streams)
+    removed_s = np.append(0.0, np.cumsum(cut))
+    last_fixed = np.maximum.accumulate(np.where(np.append(True, ~is_pause), np.arange(len(every)), 0))
+    shortened_times = every - (removed_s - removed_s[last_fixed])
+    dvl, reference, imu = (np.interp(times, every, shortened_times) for times in streams)
     return replace(
         motion, dvl=motion.dvl._replace(times=dvl), reference_times=reference, imu=motion.imu._replace(times=imu)
     )
@@ -131,8 +133,8 @@ def _speed(times: Array, velocity: Array) -> Series:
 
 
 def lag(
-    one: Series,
-    one_start: float,
+    series: Series,
+    series_start: float,
     other: Series,
     other_start: float,
     weight: Array | None = None,
@@ -144,11 +146,11 @@ def lag(
 
     Parameters
     ----------
-    one, other: (N,), (M,), every STEP_S.
-    one_start, other_start: Times of their first samples, s.
-    weight, own: (M,) weights of `other`, (N,) of `one`; default 1.
+    series, other: (N,), (M,), every STEP_S.
+    series_start, other_start: Times of their first samples, s.
+    weight, own: (M,) weights of `other`, (N,) of `series`; default 1.
     """
-    n, m = len(one), len(other)
+    n, m = len(series), len(other)
     weight = np.ones(m) if weight is None else weight
     own = np.ones(n) if own is None else own
     size = n + m
@@ -161,29 +163,29 @@ def lag(
     def means(weight: Array) -> Array:
         """Return the mean squared difference at each lag, infinite where the overlap is too short."""
         count = correlated(own, weight)
-        squares = correlated(own * np.abs(one) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
-        squares -= 2.0 * correlated(own * one, weight * other)
-        enough = count >= max(MIN_OVERLAP * min(float(n), float(weight.sum())), SHORTEST_OVERLAP_S / STEP_S)
-        return np.where(enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
+        squares = correlated(own * np.abs(series) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
+        squares -= 2.0 * correlated(own * series, weight * other)
+        is_enough = count >= max(MIN_OVERLAP * min(float(n), float(weight.sum())), SHORTEST_OVERLAP_S / STEP_S)
+        return np.where(is_enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
 
     mean = means(weight)
-    delays = one_start - other_start + STEP_S * np.arange(-(m - 1), n)
-    near = np.abs(delays) <= FARTHEST_S + STEP_S
+    delays = series_start - other_start + STEP_S * np.arange(-(m - 1), n)
+    is_near = np.abs(delays) <= FARTHEST_S + STEP_S
     best = int(np.argmin(mean))
-    nearest = float(mean[near].min()) if near.any() else np.inf
-    if not near[best] and mean[best] < MAX_SQUARE_SHARE * nearest:
+    smallest_near = float(mean[is_near].min()) if is_near.any() else np.inf
+    if not is_near[best] and mean[best] < MAX_SQUARE_SHARE * smallest_near:
         # compare on the same samples: a noisy stretch may be outside the overlap of the far delay
         index = np.arange(m) + best - (m - 1)
         overlap = np.where((index >= 0) & (index < n), weight, 0.0)
-        nearest = min(nearest, float(means(overlap)[near].min(initial=np.inf)))
+        smallest_near = min(smallest_near, float(means(overlap)[is_near].min(initial=np.inf)))
         # periodic motion may agree at far lags, but it then agrees at near lags, too, to the change within one step
-        both = weight[1:] * weight[:-1]
-        of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
-        if mean[best] < MAX_SQUARE_SHARE * nearest and nearest > of_a_step:
+        pair_weight = weight[1:] * weight[:-1]
+        step_change = float((pair_weight * np.abs(np.diff(other)) ** 2).sum() / max(pair_weight.sum(), 1.0))
+        if mean[best] < MAX_SQUARE_SHARE * smallest_near and smallest_near > step_change:
             # repeated legs agree at several lags: take the smallest
             as_good = np.where(mean <= 1.5 * mean[best], np.abs(delays), np.inf)
             return float(delays[int(np.argmin(as_good))]), True
-    best = int(np.argmin(np.where(near, mean, np.inf)))
+    best = int(np.argmin(np.where(is_near, mean, np.inf)))
     # a nearly constant speed agrees as well at any lag
-    is_better = near[best] and mean[best] < MAX_SQUARE_SHARE * mean[int(np.argmin(np.abs(delays)))]
+    is_better = is_near[best] and mean[best] < MAX_SQUARE_SHARE * mean[int(np.argmin(np.abs(delays)))]
     return float(delays[best]) if is_better else 0.0, False

@@ -27,12 +27,12 @@ def day_covariance(model: Model, parameters: Parameters) -> Array:
 
     `day_std_heading` acts about the body's vertical, `day_std_scale` on all scales alike.
     """
-    found = np.zeros((model.n_state, model.n_state))
+    covariance = np.zeros((model.n_state, model.n_state))
     if model.aided:
         upwards = parameters.rotation_dvl_from_body[:, 2]
-        found[:3, :3] = parameters.day_std_heading**2 * np.outer(upwards, upwards)
-        found[3 : model.n_errors, 3 : model.n_errors] = parameters.day_std_scale**2
-    return found
+        covariance[:3, :3] = parameters.day_std_heading**2 * np.outer(upwards, upwards)
+        covariance[3 : model.n_errors, 3 : model.n_errors] = parameters.day_std_scale**2
+    return covariance
 
 
 COMPONENTS = ("roll", "pitch", "yaw", "lever_arm_x", "lever_arm_y", "lever_arm_z", "scale", "time_offset")
@@ -93,10 +93,10 @@ class Extrinsics:
     @cached_property
     def information(self) -> Array:
         """Inverse (8, 8) of the covariance for a known bias, separately for mounting, scale and delay."""
-        found, covariance = np.zeros((N_COMPONENTS, N_COMPONENTS)), self.covariance - self.by_bias @ self.by_bias.T
+        found, covariance = (np.zeros((N_COMPONENTS, N_COMPONENTS)), self.covariance - self.by_bias @ self.by_bias.T)
         for group in GROUPS:
-            at = np.ix_(group[self.shown[group]], group[self.shown[group]])
-            found[at] = np.linalg.inv(covariance[at])
+            block = np.ix_(group[self.shown[group]], group[self.shown[group]])
+            found[block] = np.linalg.inv(covariance[block])
         return found
 
     @property
@@ -133,13 +133,13 @@ def extrinsics_of(
     )
     jacobian = _jacobian(model, state, parameters)
     covariance = jacobian @ state.p @ jacobian.T
-    common = np.zeros((N_COMPONENTS, N_AXES)) if by_bias is None else jacobian @ by_bias
-    std = np.sqrt(np.diag(covariance - common @ common.T))
+    biases = np.zeros((N_COMPONENTS, N_AXES)) if by_bias is None else jacobian @ by_bias
+    std = np.sqrt(np.diag(covariance - biases @ biases.T))
     shown = jacobian.any(axis=1) & (std <= OBSERVED_SHARE * _unknown(parameters))
     covariance += jacobian @ day_covariance(model, parameters) @ jacobian.T
     covariance = np.where(np.outer(shown, shown), 0.5 * (covariance + covariance.T), 0.0)
-    common = np.where(shown[:, None], common, 0.0)
-    return Extrinsics(name, model.name, *span_ns, value, covariance, shown, used, tuple(remarks), dvl, common, rejected)
+    biases = np.where(shown[:, None], biases, 0.0)
+    return Extrinsics(name, model.name, *span_ns, value, covariance, shown, used, tuple(remarks), dvl, biases, rejected)
 
 
 def rejection(findings: Iterable[Mapping[str, Any]]) -> str:
@@ -147,8 +147,8 @@ def rejection(findings: Iterable[Mapping[str, Any]]) -> str:
 
     A large misalignment alone does not invalidate the numbers: a mounting may have moved.
     """
-    against = (each["says"] for each in findings if each["severity"] == "reject" and each["code"] != _OF_SIZE)
-    return str(next(against, ""))
+    sentences = (each["says"] for each in findings if each["severity"] == "reject" and each["code"] != _OF_SIZE)
+    return str(next(sentences, ""))
 
 
 def dvl_in_words(frame: str, turned: bool) -> str:
@@ -156,16 +156,16 @@ def dvl_in_words(frame: str, turned: bool) -> str:
     return f"{frame}, {FRD if turned else FLU}"
 
 
-def _jacobian(model: Model, state: GaussianState, p: Parameters) -> Array:
+def _jacobian(model: Model, state: GaussianState, parameters: Parameters) -> Array:
     """Return the derivative (8, n) of the components with respect to the state."""
     errors = model.error_terms_from_state
-    found = np.zeros((N_COMPONENTS, model.n_state))
-    found[ANGLES] = rpy_jacobian(errors[:3] @ state.x, p) @ errors[:3]
-    found[SCALE] = p.rotation_dvl_from_body[:, 0] ** 2 @ errors[3:]
-    for at, name in enumerate(COMPONENTS):
+    jacobian = np.zeros((N_COMPONENTS, model.n_state))
+    jacobian[ANGLES] = rpy_jacobian(errors[:3] @ state.x, parameters) @ errors[:3]
+    jacobian[SCALE] = parameters.rotation_dvl_from_body[:, 0] ** 2 @ errors[3:]
+    for component, name in enumerate(COMPONENTS):
         if name in model.state_names:
-            found[at, model.state_names.index(name)] = 1.0
-    return found
+            jacobian[component, model.state_names.index(name)] = 1.0
+    return jacobian
 
 
 def _unknown(p: Parameters) -> Array:

@@ -110,11 +110,11 @@ def _lever_arm_findings(turns: Reason | None, is_found: bool, parameters: Parame
 
 def shown_misalignment(model: Model, state: GaussianState, parameters: Parameters) -> Array:
     """Return the misalignment (3,) about body axes, as φ is; 0 about axes that are not observable."""
-    t = parameters.rotation_dvl_from_body
-    about = t.T @ (model.error_terms_from_state @ state.x)[:3]
+    dvl_from_body = parameters.rotation_dvl_from_body
+    angles = dvl_from_body.T @ (model.error_terms_from_state @ state.x)[:3]
     std = body_angle_std(state.p, parameters)
-    observable = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > Z_ONE_TEST * std)
-    return np.where(observable, about, 0.0)
+    observable = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(angles) > Z_ONE_TEST * std)
+    return np.where(observable, angles, 0.0)
 
 
 def shown_mounting(model: Model, state: GaussianState, parameters: Parameters) -> tuple[float, float, float]:
@@ -144,10 +144,10 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
         findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject, **option))
     variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
     std = np.sqrt(variance)
-    known = (variance > 0.0) & (
+    is_observable = (variance > 0.0) & (
         (std <= OBSERVED_SHARE * parameters.initial_std_scale) | (np.abs(errors[3:]) > Z_ONE_TEST * std)
     )
-    scale = float(np.abs(errors[3:][known]).max(initial=0.0))
+    scale = float(np.abs(errors[3:][is_observable]).max(initial=0.0))
     if scale > parameters.max_scale_error:
         findings.append(finding("SCALE_LARGE", percent=100.0 * scale, limit=100.0 * parameters.max_scale_error))
     return findings
@@ -164,7 +164,7 @@ def _error_finding(
     if held_out is None:
         return finding("HELD_OUT_TOO_FEW")
     uncorrected, corrected, predicted = held_out.uncorrected, held_out.corrected, held_out.predicted
-    said: dict[str, float] = {
+    errors: dict[str, float] = {
         "samples": held_out.samples,
         "uncorrected": uncorrected,
         "corrected": corrected,
@@ -172,27 +172,27 @@ def _error_finding(
     }
     # if there is nothing to correct, a correction adds about the variance of the estimate; correlated noise makes this
     # more than the filter predicts, so a larger error is no contradiction
-    worse = corrected**2 - uncorrected**2
+    growth = corrected**2 - uncorrected**2
     is_large = corrected > MAX_ERROR_RATIO * predicted
-    is_worse = worse - held_out.interpolated**2 > WORSE_VARIANCES * max(held_out.calibration, own_error) ** 2
+    is_worse = growth - held_out.interpolated**2 > WORSE_VARIANCES * max(held_out.calibration, own_error) ** 2
     if typical_error is not None and (is_large or is_worse):
         # outliers make this comparison meaningless
-        as_usual = typical_error < (MAX_ERROR_RATIO if is_large else AS_PREDICTED) * predicted
-        if as_usual and corrected > OUTLIER_RATIO * typical_error:
-            return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
+        is_usual = typical_error < (MAX_ERROR_RATIO if is_large else AS_PREDICTED) * predicted
+        if is_usual and corrected > OUTLIER_RATIO * typical_error:
+            return finding("HELD_OUT_OUTLIERS", **errors, typical=typical_error)
     if is_worse:
-        return finding("HELD_OUT_WORSE", **said)
+        return finding("HELD_OUT_WORSE", **errors)
     if is_large:
-        return finding("HELD_OUT_SEVERAL_TIMES", **said)
+        return finding("HELD_OUT_SEVERAL_TIMES", **errors)
     if reference_claims and corrected < MIN_ERROR_RATIO * (expected := max(predicted, held_out.claimed)):
-        return finding("HELD_OUT_IMPLAUSIBLE", **said | {"predicted": expected})
-    if worse > WORSE_VARIANCES * held_out.calibration**2:
-        return finding("HELD_OUT_NO_BETTER", **said)
+        return finding("HELD_OUT_IMPLAUSIBLE", **errors | {"predicted": expected})
+    if growth > WORSE_VARIANCES * held_out.calibration**2:
+        return finding("HELD_OUT_NO_BETTER", **errors)
     dof = 3.0 * (held_out.samples if held_out.independent is None else held_out.independent)
     by_chance = math.sqrt(chi2_isf(CHANCE, dof) / dof)
     if corrected > predicted * parameters.max_error_ratio * by_chance:
-        return finding("HELD_OUT_NOISIER", **said)
-    return finding("HELD_OUT", **said)
+        return finding("HELD_OUT_NOISIER", **errors)
+    return finding("HELD_OUT", **errors)
 
 
 def _drift_findings(convergence: Convergence, remaining_drift: float, parameters: Parameters) -> list[Reason]:

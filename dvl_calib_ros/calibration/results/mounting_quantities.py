@@ -44,15 +44,15 @@ def quantities(result: Result) -> list[Quantity]:
     nominal = np.degrees(parameters.mounting_rpy)
     corrected = np.degrees(corrected_rpy(estimate.misalignment, parameters))
     std = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))
-    unknown = OBSERVED_SHARE * np.degrees(parameters.initial_std_misalignment)
-    unseen = {entry.axis for entry in estimate.observability if not entry.observed}
+    max_std = OBSERVED_SHARE * np.degrees(parameters.initial_std_misalignment)
+    not_observable = {entry.axis for entry in estimate.observability if not entry.observed}
     found = [
-        Quantity(name, float(nominal[i]), float(corrected[i]), float(std[i]), "°", bool(std[i] <= unknown))
+        Quantity(name, float(nominal[i]), float(corrected[i]), float(std[i]), "°", bool(std[i] <= max_std))
         for i, name in enumerate(("roll", "pitch", "yaw"))
     ]
     others = scale_and_delay(MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance), parameters)
     if others.scale_std is not None:
-        shown = "scale" not in unseen
+        shown = "scale" not in not_observable
         found.append(Quantity("scale", 0.0, 100.0 * others.scale, 100.0 * others.scale_std, " %", shown))
     if not _has_imu(result):
         return found
@@ -60,7 +60,7 @@ def quantities(result: Result) -> list[Quantity]:
     if arm_std is not None:
         arm = estimate.lever_arm(parameters.lever_arm)
         found += [
-            Quantity(name, parameters.lever_arm[i], float(arm[i]), float(arm_std[i]), " m", name not in unseen)
+            Quantity(name, parameters.lever_arm[i], float(arm[i]), float(arm_std[i]), " m", name not in not_observable)
             for i, name in enumerate(("lever arm x", "lever arm y", "lever arm z"))
         ]
     for delay in result.delays:

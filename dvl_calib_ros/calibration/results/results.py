@@ -395,8 +395,8 @@ def corrected_rpy(misalignment: Array, parameters: Parameters) -> Array:
 def rpy_jacobian(misalignment: Array, parameters: Parameters) -> Array:
     """Return the derivative (3, 3) of roll, pitch, yaw of the corrected mounting with respect to φ (3,)."""
     up, down = (
-        np.array([corrected_rpy(misalignment + way * each, parameters) for each in _SMALL_TURN * np.eye(3)])
-        for way in (1.0, -1.0)
+        np.array([corrected_rpy(misalignment + sign * each, parameters) for each in _SMALL_TURN * np.eye(3)])
+        for sign in (1.0, -1.0)
     )
     return near_angles(up - down, 0.0).T / (2.0 * _SMALL_TURN)
 

@@ -42,17 +42,17 @@ class ThinnedBlock(NamedTuple):
     ) -> ThinnedBlock:
         """Return the thinned columns of a block. noise_dvl: (3, 3) (m/s)²."""
         first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
-        at = first + _thinned_seconds(dvl.times[first:last])
-        own = DvlColumns(dvl.times[at], dvl.velocity[at].copy())
+        kept = first + _thinned_seconds(dvl.times[first:last])
+        thinned_dvl = DvlColumns(dvl.times[kept], dvl.velocity[kept].copy())
         first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
-        at = first + _thinned_seconds(imu.times[first:last])
+        kept = first + _thinned_seconds(imu.times[first:last])
         # rates are averaged: the noise of one sample exceeds the change until the next kept one
         reach = 0.5 * KEPT_EVERY_S
         first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
-        rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
-        turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
+        rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[kept], reach)
+        thinned_imu = ImuColumns(imu.times[kept], imu.orientation[kept], rates)
         # copies, because views would keep the whole arrays in memory
-        return ThinnedBlock(own, noise_dvl, reference._replace(velocity=reference.velocity.copy()), turning)
+        return ThinnedBlock(thinned_dvl, noise_dvl, reference._replace(velocity=reference.velocity.copy()), thinned_imu)
 
 
 def typical_error(recording: ThinnedRecording, terms: Terms, p: Parameters) -> float | None:
@@ -65,8 +65,8 @@ def without_outliers(error: Array) -> float | None:
     square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
     if not len(square):
         return None
-    good = square[square <= OUTLIER_RATIO**2 * median(square)]
-    return math.sqrt(float(good.mean()))
+    inliers = square[square <= OUTLIER_RATIO**2 * median(square)]
+    return math.sqrt(float(inliers.mean()))
 
 
 class Terms(NamedTuple):
@@ -123,38 +123,38 @@ class ThinnedRecording(NamedTuple):
 
     def judged(self, p: Parameters) -> tuple[float, Array]:
         """Return the first two sums of `Moments` over all comparable samples."""
-        seen = self.compared(np.arange(len(self.dvl.times)), NO_TERMS, p)
-        use = np.isfinite(seen.error[:, 0])
-        v, along = self.dvl.velocity[use], np.diagonal(seen.measured[use], axis1=1, axis2=2) > 0.5
-        return float(np.count_nonzero(use)), np.einsum("nk,ni,nj->kij", along, v, v)
+        comparison = self.compared(np.arange(len(self.dvl.times)), NO_TERMS, p)
+        use = np.isfinite(comparison.error[:, 0])
+        v, is_measured = (self.dvl.velocity[use], np.diagonal(comparison.measured[use], axis1=1, axis2=2) > 0.5)
+        return float(np.count_nonzero(use)), np.einsum("nk,ni,nj->kij", is_measured, v, v)
 
-    def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
+    def compared(self, rows: Index, terms: Terms, p: Parameters) -> Compared:
         """Return the comparison of DVL samples, corrected and interpolated as in pairing."""
-        times, v = self.dvl.times[at] - terms.time_offset, self.dvl.velocity[at]
+        times, velocity = self.dvl.times[rows] - terms.time_offset, self.dvl.velocity[rows]
         stamps = self.reference.times - terms.reference_time_offset
         after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
         gap = stamps[after] - stamps[after - 1]
-        part = ((times - stamps[after - 1]) / gap)[:, None]
-        g0, g1 = self.reference.velocity[after - 1], self.reference.velocity[after]
+        fraction = ((times - stamps[after - 1]) / gap)[:, None]
+        before, later = self.reference.velocity[after - 1], self.reference.velocity[after]
         in_body = self.reference.in_body[after]
         rotation, oriented = attitude_at(self.imu, times, p.imu_timeout)
         body_from_reference = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
-        body = np.matmul(body_from_reference, (g0 + (g1 - g0) * part)[..., None])[..., 0]
-        rates = np.zeros_like(v)
+        body = np.matmul(body_from_reference, (before + (later - before) * fraction)[..., None])[..., 0]
+        rates = np.zeros_like(velocity)
         if len(self.imu.times):
             rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
-        lever = np.array(p.lever_arm) + terms.lever_arm
+        arm = np.array(p.lever_arm) + terms.lever_arm
         matrix = correction_matrix(terms.errors[:3], terms.errors[3:], p.rotation_dvl_from_body)
-        error = body + (cross(rates, lever) if lever.any() else 0.0) - v @ matrix.T
-        found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
-        found &= (v**2).sum(axis=1) >= p.min_speed**2
+        error = body + (cross(rates, arm) if arm.any() else 0.0) - velocity @ matrix.T
+        is_comparable = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
+        is_comparable &= (velocity**2).sum(axis=1) >= p.min_speed**2
         # unmeasured axes are removed in the frame of the reference: at a tilt of 2° an unmeasured vertical would reach
         # the horizontal of the body
         variance = np.diagonal(self.reference.noise, axis1=1, axis2=2)
         axes = (np.maximum(variance[after], variance[after - 1]) < MEASURED_BELOW).astype(float)
         measured = (body_from_reference * axes[:, None]) @ body_from_reference.swapaxes(1, 2)
         error = np.matmul(measured, error[..., None])[..., 0]
-        error[~found] = np.nan
+        error[~is_comparable] = np.nan
         return Compared(error, measured, body, rotation, oriented, rates)
 
 
@@ -171,9 +171,9 @@ def _thinned_seconds(times: Array) -> Index:
     return np.append(0, np.flatnonzero(steps(bins)) + 1)
 
 
-def mean_around(times: Array, values: Array, at: Array, reach: float) -> Array:
+def mean_around(times: Array, values: Array, centres: Array, reach: float) -> Array:
     """Return means (M, c) of finite values (N, c) within reach (s) of times (M,) s; nan where there is none."""
-    first, end = times.searchsorted(at - reach), times.searchsorted(at + reach, side="right")
+    first, end = times.searchsorted(centres - reach), times.searchsorted(centres + reach, side="right")
     sums, finite = np.zeros((len(times) + 1, values.shape[1])), np.isfinite(values)
     if finite.all():
         np.cumsum(values, axis=0, out=sums[1:])

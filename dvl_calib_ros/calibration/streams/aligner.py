@@ -28,7 +28,10 @@ from .stream_order import LONG_AGO_NS, Admitted, Sequencer, Track
 
 
 class ScreenedStreams(NamedTuple):
-    """Columns of all streams, masks of the valid rows, and the screened values."""
+    """Columns of all streams, masks of the valid rows, and the screened values.
+
+    reference_values: (J, 12) velocity and covariance. imu_values: (M, 7) quaternion and angular velocity.
+    """
 
     streams: Streams
     dvl: Mask
@@ -41,7 +44,7 @@ class ScreenedStreams(NamedTuple):
 
 
 class OrderedStreams(NamedTuple):
-    """Admitted rows of each stream: indices in its block, and corrected stamps."""
+    """Admitted rows of each stream: indices in its block (`_at`), and corrected stamps (`_ns`)."""
 
     dvl: Admitted
     dvl_at: Index
@@ -91,40 +94,43 @@ class Events(NamedTuple):
         """Merge the samples of DVL, reference and IMU (tuples in this order) by arrival."""
         arrival = np.concatenate(arrivals)
         order = np.argsort(arrival, kind="stable")
-        at = np.empty(len(order), dtype=np.intp)
-        at[order] = np.arange(len(order))
+        event_of_sample = np.empty(len(order), dtype=np.intp)
+        event_of_sample[order] = np.arange(len(order))
         first, second = len(arrivals[0]), len(arrivals[0]) + len(arrivals[1])
-        places = at[:first], at[first:second], at[second:]
-        newest = []
-        for place, stamps, before in zip(places, stamps_ns, before_ns, strict=True):
-            column = np.full(len(order), LONG_AGO_NS if before is None else before, dtype=np.int64)
-            column[place] = stamps
-            newest.append(np.maximum.accumulate(column))
-        dvl_ns = np.maximum(newest[0], 0)
+        events_of_stream = event_of_sample[:first], event_of_sample[first:second], event_of_sample[second:]
+        newest_ns = []
+        for events, stamps, newest_before in zip(events_of_stream, stamps_ns, before_ns, strict=True):
+            column = np.full(len(order), LONG_AGO_NS if newest_before is None else newest_before, dtype=np.int64)
+            column[events] = stamps
+            newest_ns.append(np.maximum.accumulate(column))
+        dvl_ns = np.maximum(newest_ns[0], 0)
         horizon_ns = dvl_ns
-        for track_ns in newest[1:]:
+        for track_ns in newest_ns[1:]:
             ahead = (track_ns > dvl_ns) & (track_ns <= dvl_ns + max_jump_ns)
             horizon_ns = np.maximum(horizon_ns, np.where(ahead, track_ns, dvl_ns))
-        return Events(arrival[order], *places, newest[1], newest[2], horizon_ns)
+        return Events(arrival[order], *events_of_stream, newest_ns[1], newest_ns[2], horizon_ns)
 
 
 def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
     """Check all rows for validity, and screen their values."""
     dvl, reference, imu = streams
     max_speed, believed = parameters.max_speed, parameters.use_message_covariance
-    of_dvl, of_reference = (screen_columns(each.covariances, believed) for each in (dvl, reference))
+    dvl_screen, reference_screen = (screen_columns(each.covariances, believed) for each in (dvl, reference))
     orientation, rates = unit_quaternions(imu.orientation), valid_rates(imu.angular_velocity)
     return ScreenedStreams(
         streams,
-        (dvl.refused == 0) & of_dvl.valid & (of_dvl.unmeasured == 0) & are_valid_velocities(dvl.values, max_speed),
+        (dvl.refused == 0)
+        & dvl_screen.valid
+        & (dvl_screen.unmeasured == 0)
+        & are_valid_velocities(dvl.values, max_speed),
         (reference.refused == 0)
-        & of_reference.valid
-        & (of_reference.unmeasured != ALL_AXES)
+        & reference_screen.valid
+        & (reference_screen.unmeasured != ALL_AXES)
         & are_valid_velocities(reference.values, max_speed),
         (imu.refused == 0) & ~(np.isnan(orientation[:, 0]) & np.isnan(rates[:, 0])),
-        of_dvl.covariance,
-        np.concatenate([reference.values, of_reference.covariance.reshape(-1, 9)], axis=1),
-        of_reference.unmeasured,
+        dvl_screen.covariance,
+        np.concatenate([reference.values, reference_screen.covariance.reshape(-1, 9)], axis=1),
+        reference_screen.unmeasured,
         np.concatenate([orientation, rates], axis=1),
     )
 
@@ -155,7 +161,7 @@ def ordered(
 def decisions(
     partners: Pairer, rows: Rows, reference: Track, imu: Track, chunk: OrderedStreams, events: Events
 ) -> Decisions | None:
-    """Return when waiting and new rows are decided, or None if waiting may change a row's partner.
+    """Return the events that decide waiting and new rows; None if a row's reference may change while it waits.
 
     A late reference may still arrive while its row waits for attitude.
     """
@@ -167,21 +173,21 @@ def decisions(
     oriented_at = imu.decided_in(stamps_ns, since, chunk.imu_ns, events.imu_at, events.imu_ns, events.horizon_ns)
     oriented_at[:to_orient] = 0
     oriented_at = np.maximum.accumulate(oriented_at)
-    alone = reference.decided_in(
+    reached_at = reference.decided_in(
         stamps_ns, since, chunk.reference_ns, events.reference_at, events.reference_ns, events.horizon_ns
     )
-    paired_at = np.maximum(alone, oriented_at) if partners.needs_turn_rate else alone
+    paired_at = np.maximum(reached_at, oriented_at) if partners.needs_turn_rate else reached_at
     # a reference in an earth frame needs the attitude
-    in_earth_frame = _in_earth_frame(reference, chunk, stamps_ns, alone, events)
+    in_earth_frame = _in_earth_frame(reference, chunk, stamps_ns, reached_at, events)
     if in_earth_frame is not None:
         paired_at = np.where(in_earth_frame, np.maximum(paired_at, oriented_at), paired_at)
     paired_at = np.maximum.accumulate(paired_at[to_pair:])
-    alone, stamps_to_pair = alone[to_pair:], stamps_ns[to_pair:]
-    delayed = (paired_at > alone) & (paired_at < n_events)
+    reached_at, stamps_to_pair = reached_at[to_pair:], stamps_ns[to_pair:]
+    delayed = (paired_at > reached_at) & (paired_at < n_events)
     if delayed.any():
-        at, later = alone[delayed], paired_at[delayed]
-        given_up = events.reference_ns[at] < stamps_to_pair[delayed]
-        if (given_up & (events.reference_ns[later] != events.reference_ns[at])).any():
+        first, last = reached_at[delayed], paired_at[delayed]
+        given_up = events.reference_ns[first] < stamps_to_pair[delayed]
+        if (given_up & (events.reference_ns[last] != events.reference_ns[first])).any():
             return None
     return Decisions(oriented_at[to_orient:], paired_at, stamps_to_pair)
 
@@ -196,10 +202,10 @@ def _in_earth_frame(
         return None
     all_ns = np.concatenate([track.stamps_ns[track.begin : track.size], chunk.reference_ns])
     after = np.minimum(np.searchsorted(all_ns, stamps_ns), len(all_ns) - 1)
-    near = (after > 0) & (all_ns[after] - all_ns[after - 1] <= track.max_gap_ns)
+    is_near = (after > 0) & (all_ns[after] - all_ns[after - 1] <= track.max_gap_ns)
     newest_ns = events.reference_ns[np.minimum(decided_at, n_events - 1)]
-    found = (decided_at < n_events) & (stamps_ns <= newest_ns) & (stamps_ns >= newest_ns - track.retention_ns)
-    return found & (near | (all_ns[after] == stamps_ns)) & (frames[after] != BODY)
+    is_found = (decided_at < n_events) & (stamps_ns <= newest_ns) & (stamps_ns >= newest_ns - track.retention_ns)
+    return is_found & (is_near | (all_ns[after] == stamps_ns)) & (frames[after] != BODY)
 
 
 # Number of messages from which columns are faster.
@@ -243,19 +249,19 @@ class Aligner(LiveAlignment):
             self._max_jump_ns,
         )
         partners, n_events = self.partners, len(events.horizon_ns)
-        found: Decisions | None = NO_DECISIONS
+        decided: Decisions | None = NO_DECISIONS
         if n_events:
-            falls_back = (np.diff(events.horizon_ns) < 0).any()
-            found = None if falls_back else decisions(partners, self.rows, self.reference, self.imu, chunk, events)
-        if found is None:
+            goes_back = (np.diff(events.horizon_ns) < 0).any()
+            decided = None if goes_back else decisions(partners, self.rows, self.reference, self.imu, chunk, events)
+        if decided is None:
             return False
-        self._count_columns(valid, chunk, found, events)
+        self._count_columns(valid, chunk, decided, events)
         if n_events:  # without events no row can be decided
             self._append_columns(valid, chunk, events)
-            known = int(np.searchsorted(found.oriented_at, n_events))
-            partners.orient(events.imu_ns[found.oriented_at[:known]], self.parameters)
-            known = int(np.searchsorted(found.paired_at, n_events))
-            partners.pair(events.reference_ns[found.paired_at[:known]])
+            n_known = int(np.searchsorted(decided.oriented_at, n_events))
+            partners.orient(events.imu_ns[decided.oriented_at[:n_known]], self.parameters)
+            n_known = int(np.searchsorted(decided.paired_at, n_events))
+            partners.pair(events.reference_ns[decided.paired_at[:n_known]])
             self._deadline_ns = LONG_AGO_NS  # check the waiting rows again with the next sample
         self._n_messages += len(dvl)
         return True
@@ -331,10 +337,10 @@ def counted(
     """
     counts = {name: dict(tally) for name, tally in aligner.tally.items()}
     for stream, order in aligner.orders.items():
-        own = counts[stream.value]
-        own["stray"], own["held"] = order.stray, int(order.held is not None)
+        tally = counts[stream.value]
+        tally["stray"], tally["held"] = order.stray, int(order.held is not None)
         for key in ("received", "invalid", "duplicate", "out_of_order"):
-            own.setdefault(key, 0)
+            tally.setdefault(key, 0)
     dvl, pairing = counts["dvl"], counts["pairing"]
     unused = ("slow", "frozen", "turning", "no_turn_rate")
     for key in (*unused, "dropouts", "wrong_frame"):

@@ -34,22 +34,22 @@ class Clocks:
     @staticmethod
     def of(parameters: Parameters) -> Clocks:
         """Return the delays of the parameters."""
-        p = parameters
+
         return Clocks(
-            round(p.dvl_time_offset * SECOND_NS),
-            round(p.reference_time_offset * SECOND_NS),
-            round(p.imu_time_offset * SECOND_NS),
-            p.dvl_clock_drift,
-            round(p.dvl_time_jump * SECOND_NS),
-            round(p.dvl_time_jump_at * SECOND_NS),
+            round(parameters.dvl_time_offset * SECOND_NS),
+            round(parameters.reference_time_offset * SECOND_NS),
+            round(parameters.imu_time_offset * SECOND_NS),
+            parameters.dvl_clock_drift,
+            round(parameters.dvl_time_jump * SECOND_NS),
+            round(parameters.dvl_time_jump_at * SECOND_NS),
         )
 
     def dvl(self, stamp_ns: S, first_ns: int) -> S:
         """Return the true time (ns) of a DVL stamp, or of stamps (N,). first_ns: first stamp of the run."""
         true_ns = stamp_ns - self.dvl_ns
         if self.drift:
-            late = self.drift * (stamp_ns - first_ns)
-            true_ns = true_ns - (np.rint(late).astype(np.int64) if isinstance(late, np.ndarray) else round(late))
+            drift = self.drift * (stamp_ns - first_ns)
+            true_ns = true_ns - (np.rint(drift).astype(np.int64) if isinstance(drift, np.ndarray) else round(drift))
         if self.jump_ns:
             true_ns = true_ns - self.jump_ns * (stamp_ns >= self.jump_at_ns)
         return true_ns
@@ -59,5 +59,5 @@ class Clocks:
         """Largest lag between two simultaneous streams after the correction, ns."""
         drift_ns = round(self.drift * LONGEST_RUN_S * SECOND_NS)
         dvl = [self.dvl_ns + drift + jump for drift in (0, drift_ns) for jump in (0, self.jump_ns)]
-        late = [*dvl, self.reference_ns, self.imu_ns]
-        return max(late) - min(late)
+        delays = [*dvl, self.reference_ns, self.imu_ns]
+        return max(delays) - min(delays)

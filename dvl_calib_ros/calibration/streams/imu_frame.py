@@ -53,15 +53,15 @@ class ImuAlignment:
         if self.is_identity:
             return sample
         orientation, rate = sample.orientation, sample.angular_velocity
-        turned: Quaternion | None = None
+        rotated: Quaternion | None = None
         if orientation is not None:
             x, y, z, w = self._turned(np.array([orientation]))[0].tolist()
-            turned = (x, y, z, w)
-        turned_rate: Vector | None = None
+            rotated = (x, y, z, w)
+        rotated_rate: Vector | None = None
         if rate is not None:
             wx, wy, wz = self._in_body(np.array([rate]))[0].tolist()
-            turned_rate = (wx, wy, wz)
-        return ImuSample(sample.stamp_ns, turned, turned_rate)
+            rotated_rate = (wx, wy, wz)
+        return ImuSample(sample.stamp_ns, rotated, rotated_rate)
 
     def block(self, block: SampleBlock) -> SampleBlock:
         """Rotate columns of the IMU stream; rows as in `sample`."""

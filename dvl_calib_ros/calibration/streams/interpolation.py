@@ -77,14 +77,14 @@ class TurnRates(NamedTuple):
         return TurnRates(*binned(imu.times[known], imu.angular_velocity[known]))
 
 
-def shortened(pauses: Array, most: float) -> Array:
-    """Clip the longest pauses (N,), s, to a common length so that their sum is at most `most`, s."""
-    if pauses.sum() <= most:
+def shortened(pauses: Array, max_sum: float) -> Array:
+    """Clip the longest pauses (N,), s, to a common length so that their sum is at most `max_sum`, s."""
+    if pauses.sum() <= max_sum:
         return pauses
-    in_order = np.sort(pauses)
-    before = np.cumsum(in_order) - in_order
-    cut = (most - before) / np.arange(len(pauses), 0, -1)
-    return np.minimum(pauses, cut[np.argmax(in_order > cut)])
+    ascending = np.sort(pauses)
+    sum_before = np.cumsum(ascending) - ascending
+    limits = (max_sum - sum_before) / np.arange(len(pauses), 0, -1)
+    return np.minimum(pauses, limits[np.argmax(ascending > limits)])
 
 
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
@@ -108,14 +108,14 @@ def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> Array:
     stamps, rates = turns
     if len(stamps) < 2:
         return np.full((len(times), 3), np.nan)
-    smooth = local_fit(stamps, rates, times, reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S))
+    fit = local_fit(stamps, rates, times, reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S))
     after, before, outside = _neighbours(stamps, times)
     outside |= stamps[after] - stamps[before] > gap_s
-    value = smooth.value
-    if not smooth.found.all():
+    value = fit.value
+    if not fit.found.all():
         gap = np.maximum(stamps[after] - stamps[before], 1e-12)
         share = np.clip((times - stamps[before]) / gap, 0.0, 1.0)[:, None]
-        value = np.where(smooth.found[:, None], value, rates[before] + (rates[after] - rates[before]) * share)
+        value = np.where(fit.found[:, None], value, rates[before] + (rates[after] - rates[before]) * share)
     value[outside] = np.nan
     return value
 
@@ -153,17 +153,17 @@ def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mas
 
     gap_s: longest interpolated gap.
     """
-    given = ~np.isnan(imu.orientation[:, 0])
+    is_given = ~np.isnan(imu.orientation[:, 0])
     stamps, quaternions = imu.times, imu.orientation
-    if not given.all():
-        stamps, quaternions = stamps[given], quaternions[given]
+    if not is_given.all():
+        stamps, quaternions = stamps[is_given], quaternions[is_given]
     if len(stamps) < 2:
         return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
     after, before, outside = _neighbours(stamps, times)
     gap = np.maximum(stamps[after] - stamps[before], 1e-12)
     fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
-    between = slerps(quaternions.take(before, axis=0), quaternions.take(after, axis=0), fraction)
-    return rotation_from_quaternion(between), ~outside & (gap <= gap_s)
+    interpolated = slerps(quaternions.take(before, axis=0), quaternions.take(after, axis=0), fraction)
+    return rotation_from_quaternion(interpolated), ~outside & (gap <= gap_s)
 
 
 # Fewest samples on each side of a fit: with fewer it extrapolates.
@@ -207,38 +207,38 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     """
     found = ~np.isnan(reach)
     if not found.any():
-        nothing = np.full((len(at), values.shape[1]), np.nan)
-        return LocalFit(nothing, nothing, nothing[:, 0], found)
+        no_fit = np.full((len(at), values.shape[1]), np.nan)
+        return LocalFit(no_fit, no_fit, no_fit[:, 0], found)
     after = np.searchsorted(times, at)
-    around = _within(times, float(np.nanmax(reach)))
+    half_width = _within(times, float(np.nanmax(reach)))
     # window along the first axis, so that sums run over whole rows
-    index = after + np.arange(-around, around)[:, None]
-    there = (index >= 0) & (index < len(times))
+    index = after + np.arange(-half_width, half_width)[:, None]
+    exists = (index >= 0) & (index < len(times))
     index = np.clip(index, 0, len(times) - 1)
     u = (times.take(index) - at) / np.where(found, reach, 1.0)
-    near = np.abs(u)
-    falling = 1.0 - near * near * near
-    weight = np.where(there & (near < 1.0), falling * falling * falling, 0.0)
+    distance = np.abs(u)
+    taper = 1.0 - distance * distance * distance
+    weight = np.where(exists & (distance < 1.0), taper * taper * taper, 0.0)
     used = weight > 0.0
     before, after = used & (u <= 0.0), used & (u >= 0.0)
     found &= np.minimum(np.add.reduce(before, 0, dtype=np.intp), np.add.reduce(after, 0, dtype=np.intp)) >= ON_EACH_SIDE
-    first = weight * u
-    second = first * u
+    weight_u = weight * u
+    weight_u2 = weight_u * u
     # normal equations of a + b u + c u², and the first two rows of their inverse by cofactors
-    third = second * u
-    s0, s1, s2, s3, s4 = (np.add.reduce(each) for each in (weight, first, second, third, third * u))
+    weight_u3 = weight_u2 * u
+    s0, s1, s2, s3, s4 = (np.add.reduce(each) for each in (weight, weight_u, weight_u2, weight_u3, weight_u3 * u))
     c00, c01, c02 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
     c11, c12 = s0 * s4 - s2 * s2, s1 * s2 - s0 * s3
     determinant = s0 * c00 + s1 * c01 + s2 * c02
     found &= determinant > 1e-12 * s0**3
     scale = 1.0 / np.where(found, determinant, 1.0)
-    unit = np.where(found, reach, 1.0)
-    for_value = (c00 * scale) * weight + (c01 * scale) * first + (c02 * scale) * second
-    scale = scale / unit
-    for_slope = (c01 * scale) * weight + (c11 * scale) * first + (c12 * scale) * second
-    near_by = values.take(index, axis=0)
-    value, slope = np.einsum("wm,wmc->mc", for_value, near_by), np.einsum("wm,wmc->mc", for_slope, near_by)
-    return LocalFit(value, slope, np.einsum("wm,wm->m", for_slope, for_slope), found)
+    unit_s = np.where(found, reach, 1.0)
+    value_weights = (c00 * scale) * weight + (c01 * scale) * weight_u + (c02 * scale) * weight_u2
+    scale = scale / unit_s
+    slope_weights = (c01 * scale) * weight + (c11 * scale) * weight_u + (c12 * scale) * weight_u2
+    samples = values.take(index, axis=0)
+    value, slope = np.einsum("wm,wmc->mc", value_weights, samples), np.einsum("wm,wmc->mc", slope_weights, samples)
+    return LocalFit(value, slope, np.einsum("wm,wm->m", slope_weights, slope_weights), found)
 
 
 def _within(times: Array, seconds: float) -> int:
@@ -247,14 +247,14 @@ def _within(times: Array, seconds: float) -> int:
     times: (N,) s, increasing.
     """
 
-    def some(n: int) -> bool:
+    def is_reached(n: int) -> bool:
         duration = times[n:] - times[:-n]
         return bool(((duration < seconds) & (duration >= 0.0)).any())
 
     low, high = 0, 1
-    while some(high):
+    while is_reached(high):
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if some(middle) else (low, middle)
+        low, high = (middle, high) if is_reached(middle) else (low, middle)
     return high

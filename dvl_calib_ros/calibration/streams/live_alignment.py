@@ -165,7 +165,7 @@ class LiveAlignment:
             self._count_order(tally, kind)
             if kind is Order.CONFIRMED_RESTART:
                 self._restart(admitted[0].stamp_ns)
-                row = 1
+                row = 1  # after the held sample, which is row 0 of the new run
             elif kind is Order.HELD:
                 self._row_of_held = row
             if not admitted:
@@ -266,8 +266,8 @@ class LiveAlignment:
                 self.tally[stream.value]["before_restart"] += len(admitted)
                 return False
             self._before_restart.discard(stream)
-        for one in admitted:
-            self._append(track, one)
+        for each in admitted:
+            self._append(track, each)
         return bool(admitted)
 
     def _append(self, track: Track, sample: ReferenceSample | ImuSample) -> None:

@@ -15,8 +15,8 @@ SPIKE, PASSES = 12.0, 6
 def deviation_from_neighbours(values: Array) -> Array:
     """Return deviations (N, k) from the cubic through two neighbours on either side; 0 at the ends."""
     deviation = np.zeros_like(values)
-    x = values
-    deviation[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
+    v = values
+    deviation[2:-2] = v[2:-2] - (4.0 * (v[1:-3] + v[3:-1]) - v[:-4] - v[4:]) / 6.0
     return deviation
 
 
@@ -49,17 +49,17 @@ def without_spikes(
         if also_at_ends:
             deviation[:2], deviation[-2:] = (x[:2] - median(x[:5])), (x[-2:] - median(x[-5:]))
         far = (np.abs(deviation) / scale).max(axis=1)
-        at = np.flatnonzero(far >= SPIKE)
-        if not len(at):
+        suspects = np.flatnonzero(far >= SPIKE)
+        if not len(suspects):
             break
         # a good sample between two outliers deviates from them, but not from the median of five
-        about = np.clip(at, 2, len(far) - 3)[:, None] + np.arange(-2, 3)
-        alone = np.abs(x[at] - median(x[about].swapaxes(0, 1))) / noise[at]
-        far[at] = (np.minimum(np.abs(deviation[at]), alone) / scale).max(axis=1)
-        good = (far < SPIKE) | (far < neighbours(far))  # the neighbour of a larger outlier deviates because of it
-        if good.all():
+        window = np.clip(suspects, 2, len(far) - 3)[:, None] + np.arange(-2, 3)
+        from_median = np.abs(x[suspects] - median(x[window].swapaxes(0, 1))) / noise[suspects]
+        far[suspects] = (np.minimum(np.abs(deviation[suspects]), from_median) / scale).max(axis=1)
+        is_good = (far < SPIKE) | (far < neighbours(far))  # the neighbour of a larger outlier deviates because of it
+        if is_good.all():
             break
-        kept = kept[good]
+        kept = kept[is_good]
     mask: Mask = np.zeros(len(values), dtype=bool)
     mask[kept] = True
     return mask

@@ -60,10 +60,10 @@ class Pairer:
         first, rows, tally = self.n_judged, self._rows, self._tally["dvl"]
         if end <= first:
             return
-        at = slice(first - rows.base, end - rows.base)
-        rates = rows.attitude[at, 4:]
-        verdict = self.gates.judge(rows.velocity_dvl[at], rates, parameters)
-        rows.verdict[at] = verdict
+        part = slice(first - rows.base, end - rows.base)
+        rates = rows.attitude[part, 4:]
+        verdict = self.gates.judge(rows.velocity_dvl[part], rates, parameters)
+        rows.verdict[part] = verdict
         self.n_judged = end
         used = verdict == SampleUse.USED
         n_used = int(np.count_nonzero(used))
@@ -75,7 +75,7 @@ class Pairer:
         if self._has_lever_arm:
             add_count(tally, "lever_arm_uncompensated", int(np.count_nonzero(used & np.isnan(rates[:, 0]))))
         if n_used:
-            slots = np.flatnonzero(used) + at.start
+            slots = np.flatnonzero(used) + part.start
             rows.prior_known[slots] = self.prior.known_at(rows.stamps_ns[slots], rows.velocity_dvl[slots])
 
     def orient(self, newest_ns: Stamps, parameters: Parameters) -> None:
@@ -83,8 +83,8 @@ class Pairer:
         n, first, rows, track = len(newest_ns), self.n_oriented, self._rows, self._imu
         if not n:
             return
-        at = slice(first - rows.base, first + n - rows.base)
-        before, after, fraction, found = track.brackets(rows.stamps_ns[at], newest_ns)
+        part = slice(first - rows.base, first + n - rows.base)
+        before, after, fraction, found = track.brackets(rows.stamps_ns[part], newest_ns)
         if found.any():
             values = np.where(found[:, None], track.values[after, :7], math.nan)
             between = np.flatnonzero(found & (fraction != 1.0))
@@ -92,13 +92,13 @@ class Pairer:
                 earlier, later, share = track.values[before[between], :7], values[between], fraction[between]
                 values[between, :4] = slerps(earlier[:, :4], later[:, :4], share)
                 values[between, 4:] = earlier[:, 4:] + (later[:, 4:] - earlier[:, 4:]) * share[:, None]
-            rows.attitude[at] = values
+            rows.attitude[part] = values
         self.n_oriented = first + n
         if self.needs_turn_rate:
             self.judge(first + n, parameters)
-        usable = rows.verdict[at] == SampleUse.USED
+        usable = rows.verdict[part] == SampleUse.USED
         n_usable = int(np.count_nonzero(usable))
-        oriented = int(np.count_nonzero(usable & ~np.isnan(rows.attitude[at, 0] + rows.attitude[at, 4])))
+        oriented = int(np.count_nonzero(usable & ~np.isnan(rows.attitude[part, 0] + rows.attitude[part, 4])))
         add_count(self._tally["pairing"], "oriented", oriented)
         add_count(self._tally["pairing"], "not_oriented", n_usable - oriented)
         self.given[Needs.ATTITUDE] += oriented
@@ -116,8 +116,8 @@ class Pairer:
         n, first, rows, track = len(newest_ns), self.n_paired, self._rows, self._reference
         if not n:
             return
-        at = slice(first - rows.base, first + n - rows.base)
-        stamps_ns = rows.stamps_ns[at]
+        part = slice(first - rows.base, first + n - rows.base)
+        stamps_ns = rows.stamps_ns[part]
         before, after, fraction, found = track.brackets(stamps_ns, newest_ns)
         pairing = np.full(n, Pairing.UNPAIRED, dtype=np.uint8)
         if found.any():
@@ -125,23 +125,23 @@ class Pairer:
             before = np.maximum(before, track.begin)
             between = has_before & (fraction != 1.0)
             frame = track.frames[after]
-            has_attitude = (frame == BODY) | ~np.isnan(rows.attitude[at, 0])
-            fits = found & (~between | (track.frames[before] == frame))
-            pairing[fits] = np.where(has_attitude[fits], Pairing.PAIRED, Pairing.WITHOUT_ATTITUDE)
-            is_paired = fits & has_attitude
+            has_attitude = (frame == BODY) | ~np.isnan(rows.attitude[part, 0])
+            is_pair = found & (~between | (track.frames[before] == frame))
+            pairing[is_pair] = np.where(has_attitude[is_pair], Pairing.PAIRED, Pairing.WITHOUT_ATTITUDE)
+            is_paired = is_pair & has_attitude
             # The mean of two samples is less noisy than each, but neighbouring rows share the samples. The plain mean
             # of the covariances counts the information of each reference sample once.
             earlier, later = track.values[before], track.values[after]
             values = np.where(between[:, None], earlier + (later - earlier) * fraction[:, None], later)
-            rows.reference[at] = np.where(is_paired[:, None], values, math.nan)
-            rows.frames[at] = np.where(is_paired, frame, 0)
-            early, late = track.unmeasured[before], track.unmeasured[after]
-            rows.unmeasured[at] = np.where(is_paired, np.where(between, early | late, late), 0)
-            interval_ns = rows.interval_ns[at]
+            rows.reference[part] = np.where(is_paired[:, None], values, math.nan)
+            rows.frames[part] = np.where(is_paired, frame, 0)
+            earlier_bits, later_bits = track.unmeasured[before], track.unmeasured[after]
+            rows.unmeasured[part] = np.where(is_paired, np.where(between, earlier_bits | later_bits, later_bits), 0)
+            interval_ns = rows.interval_ns[part]
             shared = np.rint((track.stamps_ns[after] - track.stamps_ns[before]) / np.maximum(interval_ns, 1))
             is_shared = is_paired & has_before & (interval_ns > 0)
-            rows.weight[at] = np.where(is_shared, 1.0 / np.maximum(1.0, shared), 1.0)
-        rows.pairing[at] = pairing
+            rows.weight[part] = np.where(is_shared, 1.0 / np.maximum(1.0, shared), 1.0)
+        rows.pairing[part] = pairing
         self.n_paired = first + n
         self.decided_ns = int(stamps_ns[-1])
         is_paired = pairing == Pairing.PAIRED
@@ -149,7 +149,7 @@ class Pairer:
         add_count(tally, "paired", paired)
         add_count(tally, "unpaired", n - paired)
         add_count(tally, "without_attitude", int(np.count_nonzero(pairing == Pairing.WITHOUT_ATTITUDE)))
-        self.given[Needs.REFERENCE] += int(np.count_nonzero(is_paired & (rows.verdict[at] == SampleUse.USED)))
+        self.given[Needs.REFERENCE] += int(np.count_nonzero(is_paired & (rows.verdict[part] == SampleUse.USED)))
 
 
 class Rows(RowTable):
@@ -209,9 +209,9 @@ class Gates:
             verdict[self._frozen(velocity, p)] = SampleUse.FROZEN
         if p.max_turn_rate > 0.0:
             square = _squared(angular_velocity)
-            open_ = verdict == SampleUse.USED
-            verdict[open_ & np.isnan(square)] = SampleUse.NO_TURN_RATE
-            verdict[open_ & (square > p.max_turn_rate * p.max_turn_rate)] = SampleUse.TURNING
+            is_open = verdict == SampleUse.USED
+            verdict[is_open & np.isnan(square)] = SampleUse.NO_TURN_RATE
+            verdict[is_open & (square > p.max_turn_rate * p.max_turn_rate)] = SampleUse.TURNING
         return verdict
 
     def _frozen(self, velocity: Array, p: Parameters) -> Mask:
@@ -219,18 +219,18 @@ class Gates:
         n = len(velocity)
         if not n:
             return np.zeros(0, dtype=bool)
-        same = np.empty(n, dtype=bool)
-        same[0] = self._velocity_before is not None and tuple(velocity[0].tolist()) == self._velocity_before
+        is_same = np.empty(n, dtype=bool)
+        is_same[0] = self._velocity_before is not None and tuple(velocity[0].tolist()) == self._velocity_before
         if n > 1:
-            same[1:] = (velocity[1:] == velocity[:-1]).all(axis=1)
-        if not same.any():
+            is_same[1:] = (velocity[1:] == velocity[:-1]).all(axis=1)
+        if not is_same.any():
             x, y, z = velocity[-1].tolist()
             self._velocity_before, self._repeats = (x, y, z), 0
-            return same
-        at = np.arange(n)
-        other = np.maximum.accumulate(np.where(same, -1, at))  # index of the last change; -1: before these samples
-        repeats = np.where(other < 0, self._repeats + at + 1, at - other)
-        self.repeated += int(np.count_nonzero(same))
+            return is_same
+        index = np.arange(n)
+        last_change = np.maximum.accumulate(np.where(is_same, -1, index))  # -1: before these samples
+        repeats = np.where(last_change < 0, self._repeats + index + 1, index - last_change)
+        self.repeated += int(np.count_nonzero(is_same))
         x, y, z = velocity[-1].tolist()
         self._velocity_before, self._repeats = (x, y, z), int(repeats[-1])
         return (repeats > p.max_repeats) if p.max_repeats > 0 else np.zeros(n, dtype=bool)

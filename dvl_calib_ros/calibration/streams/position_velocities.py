@@ -24,7 +24,7 @@ def check_model(parameters: Parameters) -> None:
     """Raise ParameterError if the model needs positions and the reference has velocities."""
     if parameters.model == POSITIONS.name and not are_positions(parameters):
         raise ParameterError(
-            f"model: {POSITIONS.name} goes by positions, and {parameters.gnss_type} holds velocities; name another "
+            f"model: {POSITIONS.name} needs positions, but {parameters.gnss_type} holds velocities; name another "
             "model, or a topic of positions (--gnss-topic, gnss_type: NavSatFix or PoseWithCovarianceStamped)"
         )
 
@@ -37,12 +37,12 @@ def of_moments(times: Array, velocity: Array, imu: ImuColumns, parameters: Param
     window_s, arm = parameters.position_window, np.array(parameters.lever_arm)
     if not arm.any() or len(times) < 2:
         return _deconvolved(times, velocity, window_s)
-    now, before, after = (attitude_at(imu, times + half, GAP_S) for half in (0.0, -0.5 * window_s, 0.5 * window_s))
+    middle, start, end = (attitude_at(imu, times + half, GAP_S) for half in (0.0, -0.5 * window_s, 0.5 * window_s))
     rates = angular_velocity_at(TurnRates.of(imu), times, GAP_S)
-    known = before[1] & after[1] & now[1] & np.isfinite(rates).all(axis=1)
-    of_window = np.where(known[:, None], (after[0] - before[0]) @ arm / window_s, 0.0)
-    of_moment = np.where(known[:, None], np.einsum("nij,nj->ni", now[0], cross(rates, arm)), 0.0)
-    return _deconvolved(times, velocity + of_window, window_s) - of_moment
+    known = start[1] & end[1] & middle[1] & np.isfinite(rates).all(axis=1)
+    arm_mean = np.where(known[:, None], (end[0] - start[0]) @ arm / window_s, 0.0)
+    arm_velocity = np.where(known[:, None], np.einsum("nij,nj->ni", middle[0], cross(rates, arm)), 0.0)
+    return _deconvolved(times, velocity + arm_mean, window_s) - arm_velocity
 
 
 def _deconvolved(times: Array, velocity: Array, window_s: float) -> Array:
@@ -54,17 +54,17 @@ def _deconvolved(times: Array, velocity: Array, window_s: float) -> Array:
     if len(times) < 2:
         return velocity
     known = np.ones(len(times), dtype=bool)
-    sides = []
+    shifted_times = []
     for shifted in (times - window_s, times + window_s):
         after = np.clip(np.searchsorted(times, shifted), 1, len(times) - 1)
         # no correction beyond an end and across an outage
         known &= (shifted >= times[0]) & (shifted <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
-        sides.append(shifted)
-    found, bend = velocity.copy(), velocity
+        shifted_times.append(shifted)
+    corrected, difference = velocity.copy(), velocity
     for factor in SERIES:
-        around = sum(np.column_stack([np.interp(shifted, times, axis) for axis in bend.T]) for shifted in sides)
-        bend = np.where(known[:, None], around - 2.0 * bend, 0.0)
-        found += factor * bend
+        sides = sum(np.column_stack([np.interp(at, times, axis) for axis in difference.T]) for at in shifted_times)
+        difference = np.where(known[:, None], sides - 2.0 * difference, 0.0)
+        corrected += factor * difference
         # the next difference needs this one on both sides
-        known = known & np.all([np.interp(shifted, times, known) > 0.99 for shifted in sides], axis=0)
-    return found
+        known = known & np.all([np.interp(shifted, times, known) > 0.99 for shifted in shifted_times], axis=0)
+    return corrected

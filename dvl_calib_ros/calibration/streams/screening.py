@@ -85,19 +85,19 @@ def screened_covariances(covariance: Array, believed: bool = True) -> tuple[Mask
     with np.errstate(invalid="ignore", over="ignore"):
         finite = np.isfinite(covariance.reshape(-1, 9).sum(axis=1))
         is_large = variance >= NOT_MEASURED_VARIANCE
-        says_nothing: Mask = np.logical_and(is_large.all(axis=1), not believed)
-        unmeasured = (variance == _NOT_MEASURED_FLAG) | (is_large & ~says_nothing[:, None])
-        least = np.where(unmeasured, 1.0, variance).min(axis=1)
-        given = (least >= SMALLEST_VARIANCE) & ~says_nothing
-        found = 0.5 * (covariance + covariance.swapaxes(1, 2))
-        found = np.where(unmeasured[:, :, None] | unmeasured[:, None, :], 0.0, found)
-        found[:, range(3), range(3)] = np.where(unmeasured, 1.0, variance)
-        xx, yy, zz = found[:, 0, 0], found[:, 1, 1], found[:, 2, 2]
-        xy, xz, yz = found[:, 0, 1], found[:, 0, 2], found[:, 1, 2]
+        is_empty: Mask = np.logical_and(is_large.all(axis=1), not believed)
+        unmeasured = (variance == _NOT_MEASURED_FLAG) | (is_large & ~is_empty[:, None])
+        smallest = np.where(unmeasured, 1.0, variance).min(axis=1)
+        given = (smallest >= SMALLEST_VARIANCE) & ~is_empty
+        symmetric = 0.5 * (covariance + covariance.swapaxes(1, 2))
+        symmetric = np.where(unmeasured[:, :, None] | unmeasured[:, None, :], 0.0, symmetric)
+        symmetric[:, range(3), range(3)] = np.where(unmeasured, 1.0, variance)
+        xx, yy, zz = symmetric[:, 0, 0], symmetric[:, 1, 1], symmetric[:, 2, 2]
+        xy, xz, yz = symmetric[:, 0, 1], symmetric[:, 0, 2], symmetric[:, 1, 2]
         determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
         definite = (xx * yy - xy * xy > 0.0) & (determinant > 0.0)
-    valid = finite & (least >= 0.0) & (definite | ~given)
-    return valid, given, found, (unmeasured * AXIS_BITS).sum(axis=1).astype(np.uint8)
+    valid = finite & (smallest >= 0.0) & (definite | ~given)
+    return valid, given, symmetric, (unmeasured * AXIS_BITS).sum(axis=1).astype(np.uint8)
 
 
 def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[bool, bool, bool]:
@@ -139,11 +139,11 @@ class ScreenedColumns(NamedTuple):
 
 def screen_columns(covariances: Covariances, believed: bool = True) -> ScreenedColumns:
     """Screen the covariances of N rows."""
-    valid, given, found, unmeasured = screened_covariances(covariances.distinct, believed)
+    valid, given, covariance, unmeasured = screened_covariances(covariances.distinct, believed)
     # the last entry is for rows without covariance, whose index is -1
     valid, unmeasured = np.append(valid, True), np.append(unmeasured, np.uint8(0))
-    found = np.concatenate([np.where(given[:, None, None], found, np.nan), np.full((1, 3, 3), np.nan)])
-    return ScreenedColumns(valid[covariances.index], found[covariances.index], unmeasured[covariances.index])
+    covariance = np.concatenate([np.where(given[:, None, None], covariance, np.nan), np.full((1, 3, 3), np.nan)])
+    return ScreenedColumns(valid[covariances.index], covariance[covariances.index], unmeasured[covariances.index])
 
 
 def unit_quaternion(q: Quaternion | None) -> Quaternion | None:

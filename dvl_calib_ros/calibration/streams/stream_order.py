@@ -153,8 +153,8 @@ def strays(stamps_ns: Stamps, max_jump_ns: int) -> Mask:
     stray = np.zeros(len(stamps_ns), dtype=bool)
     if len(stamps_ns) > 2:
         before, after = stamps_ns[1:-1] - stamps_ns[:-2], stamps_ns[2:] - stamps_ns[1:-1]
-        far = (np.abs(before) > max_jump_ns) & (np.abs(after) > max_jump_ns) & (np.sign(before) != np.sign(after))
-        stray[1:-1] = far & (np.abs(stamps_ns[2:] - stamps_ns[:-2]) <= max_jump_ns)
+        is_far = (np.abs(before) > max_jump_ns) & (np.abs(after) > max_jump_ns) & (np.sign(before) != np.sign(after))
+        stray[1:-1] = is_far & (np.abs(stamps_ns[2:] - stamps_ns[:-2]) <= max_jump_ns)
     return stray
 
 
@@ -259,8 +259,8 @@ class Track(RowTable):
             return decided
         given_up_ns = np.where(overdue, horizon_ns - self.max_latency_ns, LONG_AGO_NS)
         bounds = np.concatenate([[0], np.flatnonzero(np.diff(newest_ns)) + 1, [n_events]])
-        of_interest = np.flatnonzero(given_up_ns[bounds[1:] - 1] != LONG_AGO_NS)
-        for start, stop in zip(bounds[of_interest].tolist(), bounds[of_interest + 1].tolist(), strict=True):
+        with_overdue = np.flatnonzero(given_up_ns[bounds[1:] - 1] != LONG_AGO_NS)
+        for start, stop in zip(bounds[with_overdue].tolist(), bounds[with_overdue + 1].tolist(), strict=True):
             low = int(np.searchsorted(stamps_ns, newest_ns[start], side="right"))
             high = int(np.searchsorted(stamps_ns, given_up_ns[stop - 1], side="right"))
             given_up = np.searchsorted(given_up_ns[start:stop], stamps_ns[low:high]) + start
@@ -291,10 +291,10 @@ class Track(RowTable):
     def brackets(self, stamps_ns: Stamps, newest_ns: Stamps) -> Brackets:
         """Return `bracket` for columns; newest_ns: (N,) newest stamp of this stream at each decision."""
         if len(stamps_ns) == 1:  # live there is one row: faster
-            one = self.bracket(int(stamps_ns[0]), int(newest_ns[0]))
-            slots = np.array([-1, 0] if one is None else [one.before, one.after])
-            fraction = np.array([1.0 if one is None else one.fraction])
-            return Brackets(slots[:1], slots[1:], fraction, np.array([one is not None]))
+            bracket = self.bracket(int(stamps_ns[0]), int(newest_ns[0]))
+            slots = np.array([-1, 0] if bracket is None else [bracket.before, bracket.after])
+            fraction = np.array([1.0 if bracket is None else bracket.fraction])
+            return Brackets(slots[:1], slots[1:], fraction, np.array([bracket is not None]))
         stamps = self.stamps_ns[self.begin : self.size]
         if not len(stamps):
             nowhere = np.zeros(len(stamps_ns), dtype=np.intp)
@@ -333,6 +333,7 @@ class NewDays:
             return False
         if interval_ns > self._pause_ns:
             return True
+        # in a joint replay, a limit between two recordings lies between the two stamps
         before = bisect_right(self._recordings_ns, stamp_ns - interval_ns)
         return bisect_right(self._recordings_ns, stamp_ns) > before
 

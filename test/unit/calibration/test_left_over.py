@@ -82,7 +82,7 @@ def test_on_a_calm_vehicle_it_is_said_that_its_trim_may_be_in_the_mounting(rng):
     levelled = np.einsum("nji,nj->ni", vehicle.level, vehicle.earth)
     for dvl in (levelled, None):
         (said,) = residual_warnings(vehicle.found(dvl=dvl))
-        assert said.severity is Severity.WARNING and said.code == "TILT_NOT_SHOWN" and "3.0° of pitch" in said.says
+        assert said.severity is Severity.WARNING and said.code == "TILT_NOT_SHOWN" and "by 3.0°" in said.says
     assert residual_warnings(Vehicle(rng, trim_deg=0.2, wave_deg=0.1).found()) == []
 
 

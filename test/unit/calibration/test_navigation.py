@@ -71,7 +71,7 @@ def test_one_degree_of_yaw_on_a_straight_course_is_17_metres_per_km_and_gone_whe
     assert found.before.percent == pytest.approx(1.745, rel=0.01)
     assert found.after.per_km < 0.01 and found.noise_per_km < 0.01
     assert found.before.end == pytest.approx(0.01745 * found.distance_m, rel=0.01)
-    assert ("without headings" in in_words(found)[1]) is not attitude
+    assert ("headings are unknown" in in_words(found)[1]) is not attitude
 
 
 def test_lever_arm_and_delay_are_part_of_what_is_corrected():

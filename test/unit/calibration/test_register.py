@@ -13,7 +13,7 @@ from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, 
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.registration import registration
 from dvl_calib_ros.calibration.registration.configuration_check import SIGNS, fitting_configuration, wrong_axes
-from dvl_calib_ros.calibration.registration.delay_search import FARTHEST_S, _minima, places
+from dvl_calib_ros.calibration.registration.delay_search import FARTHEST_S, _minima, candidate_delays
 from dvl_calib_ros.calibration.registration.gauss_newton import (
     DELTA,
     DVL,
@@ -239,7 +239,7 @@ def test_too_little_is_none():
     short = make_motion((td[:5], v[:5]), (tg[:5], g[:5]), True, (True,) * 3, imu)
     assert register(short, np.eye(3), np.zeros(3)) is None
     apart = make_motion((td, v), (tg + 5000.0, g), True, (True,) * 3, imu)
-    assert places(apart, np.eye(3)) == [] and register(apart, np.eye(3), np.zeros(3)) is None
+    assert candidate_delays(apart, np.eye(3)) == [] and register(apart, np.eye(3), np.zeros(3)) is None
 
 
 def test_at_one_speed_the_clock_of_a_reference_is_in_the_arm_and_the_delay():

@@ -11,13 +11,13 @@ from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
 from dvl_calib_ros.calibration.registration import clock_domains
-from dvl_calib_ros.calibration.registration.clock_domains import MOST, _Spread
+from dvl_calib_ros.calibration.registration.clock_domains import MOST, _ThinnedValues
 from dvl_calib_ros.verdict.kinds import Severity
 
 
 @pytest.mark.parametrize("sizes", [[10], [MOST, 1], [MOST + 1], [3, 4096, 7, 4096] * 40, [1] * 20_000])
 def test_of_many_numbers_every_so_many_th_is_kept(sizes):
-    spread, numbers, first = _Spread(), np.arange(sum(sizes)), 0
+    spread, numbers, first = _ThinnedValues(), np.arange(sum(sizes)), 0
     for size in sizes:
         spread.add(numbers[first : first + size])
         first += size

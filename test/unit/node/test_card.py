@@ -16,10 +16,10 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample, VelocityFrame
 from dvl_calib_ros.node.operator_card import (
     LEAST_LOOKS,
+    REPLANNED_EVERY_S,
     SECTORS,
     SPREAD,
     STANDS_S,
-    THOUGHT_OF_EVERY_S,
     Card,
     RecentWorth,
     RemainingTime,
@@ -103,7 +103,7 @@ def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
     card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="full"))
     for second in range(11):
         values(card, calibrator, counts(second), float(second))
-    assert len(calls) == 1 + 10 // THOUGHT_OF_EVERY_S
+    assert len(calls) == 1 + 10 // REPLANNED_EVERY_S
 
 
 def looks(card, calibrator, factors, rate=1.0, since_s=0.0):
