@@ -98,7 +98,7 @@ def test_a_publisher_of_another_type_is_named_with_the_parameter_to_set(world):
             "the diagnostics to say what to set",
         )
         # its name may be discovered later than its topic
-        named = "test_client publishes nav_msgs/msg/Odometry, where"
+        named = "test_client publishes nav_msgs/msg/Odometry instead of"
         until(lambda: named in diagnostics[-1].status[0].message, "the diagnostics to name it")
         world.node.destroy_publisher(publisher)
         until(lambda: "Odometry" not in diagnostics[-1].status[0].message, "diagnostics without it")

@@ -22,7 +22,7 @@ DEFINITIONS = {
     "evaluation.md": ("R 0.2 m/s with GNSS and 0.025 m/s without",),
     "models.md": ("(1.9988, -0.0698, 0)",),
     "recordings.md": ("median speed below 0.3 m/s",),
-    "operate.md": ("A scale error of 0.5 % is 7.5 m/s of speed of sound",),
+    "operate.md": ("A scale error of 0.5 % corresponds to 7.5 m/s of speed of sound",),
 }
 
 

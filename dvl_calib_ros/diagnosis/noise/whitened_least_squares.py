@@ -56,7 +56,10 @@ class WhitenedLeastSquares:
     @property
     def is_definite(self) -> bool:
         """Return whether there is a unique minimum."""
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._normal), 1e-300))
+        diagonal = np.diag(self._normal)
+        if not (diagonal > 0.0).all():  # more noise was subtracted than the columns hold
+            return False
+        scale = 1.0 / np.sqrt(diagonal)
         return bool(np.linalg.eigvalsh(scale[:, None] * self._normal * scale)[0] > 1e-9)
 
     def solution(self) -> Array:

@@ -887,6 +887,13 @@ def test_whitened_least_squares_is_least_squares_with_a_prior(rng):
     np.testing.assert_allclose(alone.solution(), np.linalg.lstsq(two, right, rcond=None)[0], rtol=1e-9)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_system_from_which_more_noise_is_subtracted_than_it_holds_is_not_definite():
+    gram = np.array([[-2.0, 1e300, 0.0], [1e300, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert not WhitenedLeastSquares(gram, np.ones(2), np.zeros(2)).is_definite
+    assert WhitenedLeastSquares(np.eye(3), np.ones(2), np.zeros(2)).is_definite
+
+
 def test_what_noise_makes_of_least_squares_is_taken_off_and_what_is_mostly_noise_is_left_alone(rng):
     """Scale for noise (errors in variables): of a column that is noise to a third, two thirds were found."""
     m, std = 100_000, np.full(2, 1e3)
