@@ -79,27 +79,29 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     information, vector: (n, n), (n,) prior of the states.
     mean: (3,) m/s, mean velocity in the DVL.
     """
-    n_states, p = len(vector), np.linalg.inv(information)
-    start = p @ vector
-    p[BIAS, BIAS] += BIAS_STD**2 * np.eye(3)
-    # without a vertical reference nothing else holds the scale of z
+    n_states, covariance = len(vector), np.linalg.inv(information)
+    prior_mean = covariance @ vector
+    covariance[BIAS, BIAS] += BIAS_STD**2 * np.eye(3)
+    # information of the states, the scale of z, the beam; without a vertical reference nothing else holds the scale
     prior = np.diag([*np.zeros(n_states), Z_SCALE_STD**-2.0, 0.0])
-    prior[:n_states, :n_states] = np.linalg.inv(p)
-    vector = prior[:n_states, :n_states] @ start
-    all_blocks, fitted = blocks.of(0), []
-    for number in range(1, N_EFFECTS):
-        states = np.append(np.arange(n_states + 1), n_states + number)
-        each = all_blocks.part(states)
-        if each.total[-1, -1] <= 0.0:
+    prior[:n_states, :n_states] = np.linalg.inv(covariance)
+    prior_vector = np.append(prior[:n_states, :n_states] @ prior_mean, [0.0, 0.0])
+    all_blocks, candidates = blocks.of(0), []
+    for effect in range(1, N_EFFECTS):
+        equations = all_blocks.part(np.append(np.arange(n_states + 1), n_states + effect))
+        if equations.total[-1, -1] <= 0.0:
             continue
-        p = np.linalg.inv(prior + each.total)
-        x = p @ (each.vector.sum(axis=0) + np.append(vector, [0.0, 0.0]))
-        fitted.append((float(x[-1]), math.sqrt(p[-1, -1]) * float(inflations([each], x[None], p[None])[0, -1]), number))
-    share, std, number = max(fitted, key=lambda each: abs(each[0]) / each[1], default=(0.0, 1.0, N_EFFECTS - 1))
-    if number == N_EFFECTS - 1:
+        posterior = np.linalg.inv(prior + equations.total)
+        x = posterior @ (equations.vector.sum(axis=0) + prior_vector)
+        inflation = float(inflations([equations], x[None], posterior[None])[0, -1])
+        candidates.append((float(x[-1]), math.sqrt(posterior[-1, -1]) * inflation, effect))
+    no_beam = (0.0, 1.0, N_EFFECTS - 1)
+    share, std, effect = max(candidates, key=lambda each: abs(each[0]) / each[1], default=no_beam)
+    if effect == N_EFFECTS - 1:  # the scale that grows with speed
         return None
-    relative = abs(share) * float(np.linalg.norm(BEAMS[number - 1] @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
-    return BeamFault(abs(share), std, (AZIMUTHS_DEG[number - 1] + 180.0 * (share < 0.0)) % 360.0, relative)
+    beam = effect - 1
+    relative = abs(share) * float(np.linalg.norm(BEAMS[beam] @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
+    return BeamFault(abs(share), std, (AZIMUTHS_DEG[beam] + 180.0 * (share < 0.0)) % 360.0, relative)
 
 
 def beam_warning(found: BeamFault | None, accepted: float) -> list[Reason]:
