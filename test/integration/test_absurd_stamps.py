@@ -98,18 +98,11 @@ def verdicts(found: dict[str, Any]) -> tuple[str, str, str]:
     return found["doctor"]["verdict"], replayed["verification"][model]["verdict"], found["diagnose"]["verdict"]
 
 
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory, messages) -> tuple[str, str, str]:
-    found, _ = answers(changed(tmp_path_factory.mktemp("far") / "bag", messages, lambda _, log, own, i, n: (log, own)))
-    return verdicts(found)
-
-
 @pytest.mark.parametrize("case", CASES)
-def test_the_commands_say_what_they_say_without_it(tmp_path, messages, sound, case):
+def test_the_commands_say_what_they_say_without_it(tmp_path, messages, case):
     change, aside = CASES[case]
     found, printed = answers(changed(tmp_path / "bag", messages, change))
-    assert verdicts(found) == sound
-    assert sound[:2] == ("yes", "accept")
+    assert verdicts(found) == ("yes", "accept", "insufficient_excitation")  # as of the sound recording
     assert found["replay"]["counts"]["calibration"]["restarts"] == 0
     for topic, count in aside.items():
         words = f"{topic}: {count} of {sum(of == topic for of, *_ in messages)} messages are set aside:"

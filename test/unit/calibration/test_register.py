@@ -281,8 +281,7 @@ def _of_its_own(one: MotionStreams) -> MotionStreams:
 
 
 MIRRORED = {
-    (1.0, 1.0, 1.0): None, (1.0, -1.0, 1.0): "y", (1.0, 1.0, -1.0): "z", (-1.0, 1.0, 1.0): "x",
-    (-1.0, -1.0, -1.0): "each of x, y and z",
+    (1.0, 1.0, 1.0): None, (1.0, -1.0, 1.0): "y", (1.0, 1.0, -1.0): "z", (-1.0, -1.0, -1.0): "each of x, y and z",
 }  # fmt: skip
 
 
@@ -305,19 +304,17 @@ def test_a_left_handed_driver_is_named_with_its_axis(signs, axis):
 QUARTER = Parameters(mounting_rpy=(0.0, 0.0, 0.5 * np.pi))
 
 
-@pytest.mark.parametrize("axis", "xz")
-def test_a_left_handed_driver_at_90_degrees_is_named_with_its_axis(axis):
+def test_a_left_handed_driver_at_90_degrees_is_named_with_its_axis():
     """With x mirrored it was accepted, with a yaw 6 degrees off."""
     (td, v), (tg, g), imu = run("free", 5.0)
     quarter = rotation_from_rpy((0.0, 0.0, 0.5 * np.pi))
     heave = np.array([[0.0, 0.0, 0.1]])
     v = v + heave * np.sin(2.0 * np.pi * td / 7.3)[:, None]
-    signs = np.where(np.array([*"xyz"]) == axis, -1.0, 1.0)
     g = g + heave * np.sin(2.0 * np.pi * tg / 7.3)[:, None]
-    made = make_motion((td, (v @ quarter) * signs), (tg, g), True, (True,) * 3, ImuColumns(*imu))
+    made = make_motion((td, (v @ quarter) * [-1.0, 1.0, 1.0]), (tg, g), True, (True,) * 3, ImuColumns(*imu))
     found = register(made, quarter, np.zeros(3))
     said = fitting_configuration(made, VelocityFrame.ENU, found, QUARTER)
-    assert said and (said.code, said.numbers) == ("DVL_LEFT_HANDED", {"axis": axis, "alike": ""})
+    assert said and (said.code, said.numbers) == ("DVL_LEFT_HANDED", {"axis": "x", "alike": ""})
 
 
 def test_a_scale_of_one_axis_is_judged_by_the_residual_with_that_scale():
