@@ -265,8 +265,9 @@ def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
     assert diagnosis.gap.not_explained < 0.01
 
 
-def test_noise_alone_is_not_taken_for_an_effect():
-    assert diagnosed("lawnmower", seed=2).verdict not in CLAIMS
+@pytest.mark.parametrize(("trajectory", "seed"), [("box", 1), ("lawnmower", 2), ("figure8", 3), ("free", 4)])
+def test_noise_alone_is_not_taken_for_an_effect(trajectory, seed):
+    assert diagnosed(trajectory, seed=seed).verdict not in CLAIMS
 
 
 def test_slow_noise_of_the_reference_at_1_hz_is_no_water_that_comes_and_goes():
