@@ -52,8 +52,8 @@ MUTANTS = (
     Mutant(
         "gate",
         "dvl_calib_ros/calibration/numerics/kalman.py",
-        "use = usable[i] and nis_i <= gate[i]",
-        "use = usable[i]",
+        "is_used = usable[i] and nis_i <= gate[i]",
+        "is_used = usable[i]",
         (UNIT + "calibration/test_kalman.py",),
     ),
     Mutant(

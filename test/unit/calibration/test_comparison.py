@@ -289,7 +289,7 @@ def test_a_lever_arm_that_is_taken_as_known_and_is_another_is_remarked():
 
 def test_nothing_shown_by_two_is_one_line():
     blank = {"shown": np.zeros(8, dtype=bool), "covariance": np.zeros((8, 8))}
-    with pytest.raises(InputError, match="no angle that two of them have shown"):
+    with pytest.raises(InputError, match="no angle is observable in two of them"):
         compare([extrinsics(0), extrinsics(1, **blank)])
     with pytest.raises(InputError, match="one alone"):
         compare([extrinsics(0)])
