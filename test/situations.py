@@ -297,9 +297,9 @@ SITUATIONS = {
     "one axis negated": Situation(
         told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate z in the DVL's driver"
     ),
-    "one beam low": Situation(told_by(one_beam_low, long_motion), "BEAM_OFF", "at 135°"),
+    "one beam low": Situation(told_by(one_beam_low, long_motion), "BEAM_OFF", "135° to port"),
     "one beam low, which looks like a misalignment": Situation(
-        told_by(one_beam_low_at_5_degrees, long_motion), "BEAM_OFF", "at 180°", yaw_deg=5.0, verdicts=("reject",)
+        told_by(one_beam_low_at_5_degrees, long_motion), "BEAM_OFF", "180° to port", yaw_deg=5.0, verdicts=("reject",)
     ),
     "quaternion components mixed up": Situation(
         told_by(quaternion_components_mixed_up), "GRAVITY_LEANS", "check the IMU's mounting in its driver"

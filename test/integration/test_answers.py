@@ -89,7 +89,7 @@ def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
     assert "ready to paste" not in text and "static_transform_publisher" not in text
     assert 'class="number"' not in text and 'class="number ' not in text
     out, _ = succeed(capsys, "apply", saved)
-    assert "URDF" not in out and "static_transform_publisher" not in out and "not to be applied" in out
+    assert "URDF" not in out and "static_transform_publisher" not in out and "should not be applied" in out
     assert "reject" in fail(capsys, "apply", saved, "--launch", tmp_path / "dvl.launch.xml")
     assert "reject" in fail(capsys, "export", "gazebo", saved, "-o", tmp_path / "dvl.sdf")
 
