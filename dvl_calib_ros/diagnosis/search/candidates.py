@@ -27,6 +27,8 @@ from .clock_jumps import LEAP
 
 # Variants to combine; proposals fitted per round
 SHORTLIST, N_PROPOSALS = 12, 7
+# Places for the largest gains on top of the fit: next to seconds of clock offset a drift adds little
+N_LARGEST_GAINS = 4
 # Start times kept per intermittent effect
 KEPT_VARIANTS = 2
 # Share of the coloured noise's misfit that an intermittent effect may leave
@@ -199,25 +201,28 @@ def _shortlisted(table: LinearisedModel, present: Sequence[int], cost: Sequence[
     """Return all variants of the fit and the most promising others, alone or in addition."""
     misfit, empty_misfit = table.misfit(present), table.misfit([])
     gains: dict[int, float] = {}
+    adds: dict[int, float] = {}
     for index in range(len(table.variants)):
         if index in present:
             continue
         by_itself = empty_misfit - table.misfit([index]) - cost[index]
-        added = misfit - table.misfit([*present, index]) - cost[index]
+        adds[index] = misfit - table.misfit([*present, index]) - cost[index]
         instead = max(
             (table.misfit(rest) - table.misfit([*rest, index]) - cost[index]
              for rest in ([i for i in present if i != out] for out in present)),
             default=-np.inf,
         )  # fmt: skip
         # strong effects resemble whatever explains much by itself: the gain in addition counts more
-        gains[index] = max(added, 0.1 * instead, 0.01 * by_itself)
+        gains[index] = max(adds[index], 0.1 * instead, 0.01 * by_itself)
     kept: list[int] = []
     of_effect: dict[str, int] = {}
-    for index in sorted(gains, key=lambda i: -gains[i]):
-        name = table.variants[index].effect.name
-        if of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < SHORTLIST:
-            kept.append(index)
-            of_effect[name] = of_effect.get(name, 0) + 1
+    by_addition = sorted((i for i in adds if adds[i] > 0.0), key=lambda i: -adds[i])
+    for limit, ranked in ((N_LARGEST_GAINS, by_addition), (SHORTLIST, sorted(gains, key=lambda i: -gains[i]))):
+        for index in ranked:
+            name = table.variants[index].effect.name
+            if index not in kept and of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < limit:
+                kept.append(index)
+                of_effect[name] = of_effect.get(name, 0) + 1
     return [*present, *kept]
 
 
