@@ -41,6 +41,8 @@ INTERPOLATION_SHARE = 0.005
 # Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
 # fifteen functions of the turn rate.
 EQUAL_LOG_P = 6.0
+# A column belongs to a group whose functions leave less than this share of its squares
+GROUP_RESIDUAL_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -250,7 +252,8 @@ def _is_predictive(problem: Problem, fit: Fit, columns: Array, min_gain: float) 
 def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
     """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
 
-    Better means better prediction of held-out stretches. Only effects below `SETTINGS.instead_of` are tested.
+    Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
+    cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
     """
     fitter, fit = selection.fitter, selection.fit
     problem, unexplained = fitter.problem, find_unexplained(fitter, fit)
@@ -261,7 +264,7 @@ def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Un
         if drop > SETTINGS.instead_of:
             continue
         new = find_unexplained(fitter, reduced.fit)
-        if not new.found or not is_predictive(problem, reduced.fit, new):
+        if not new.found or is_of_group(problem, fit, out, new.about) or not is_predictive(problem, reduced.fit, new):
             continue
         gain = _held_out_gain(problem, fit, reduced.fit, new) - SETTINGS.indistinguishable - INTERPOLATION_SHARE * drop
         if gain > 0.0 and (best is None or gain > best[0]):
@@ -287,6 +290,25 @@ def nuisance_shift(problem: Problem, fit: Fit, unexplained: Unexplained) -> Arra
     slow = SlowNoiseOfFit.of_fit(problem, fit).with_nuisance(problem, fit.noise, unexplained.clearest)
     system = slow.known._replace(centre=np.zeros_like(slow.known.centre))  # linearised at the fit, whatever its prior
     return system.step(slow.noise, fit.residual).solution()[: fit.columns.shape[2]]
+
+
+def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: str | float) -> bool:
+    """Return whether the columns of some effects of a fit, without its calibration, lie in one group.
+
+    about: what a residual follows; a period (s) and an event are no group.
+    """
+    groups = dictionary(problem, fit.seen)
+    if isinstance(about, float) or about not in groups:
+        return False
+    noise, parameters = fit.noise, fit.hypothesis.parameters()
+    own = [6 + at for at, each in enumerate(parameters) if each.effect in effects]
+    functions = _along_axes(groups[about], problem.axes)
+    calibration = orthonormal(noise.whiten(fit.columns[:, :, :6]))
+    own_columns = noise.whiten(fit.columns[:, :, own])
+    own_columns = own_columns - calibration @ (calibration.T @ own_columns)
+    group = orthonormal(np.concatenate([calibration, noise.whiten(functions)], axis=1))
+    residual = own_columns - group @ (group.T @ own_columns)
+    return bool(((residual**2).sum(axis=0) < GROUP_RESIDUAL_SHARE * (own_columns**2).sum(axis=0)).all())
 
 
 def _along_axes(functions: Array, axes: int) -> Array:

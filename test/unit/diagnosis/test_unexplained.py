@@ -26,6 +26,7 @@ from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
 from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import (
     find_unexplained,
+    is_of_group,
     is_predictive,
     without_replaceable,
 )
@@ -221,6 +222,25 @@ def test_how_sure_the_places_of_a_gap_are_does_not_go_by_how_columns_of_nothing_
     once, again = (places(fitter, replace(base, made=made), base, arm) for made in (base.made, lambda: mixed))
     assert len(once) > 3
     np.testing.assert_allclose([np.log(each.p) for each in again], [np.log(each.p) for each in once], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("about", "is_some"), [("sway and heave", True), ("turn rate", False), (40.0, False)])
+def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_predicts_elsewhere(
+    monkeypatch, about, is_some
+):
+    """A shear of two degrees, errors along one axis per speed along another, was functions of sway and heave."""
+    shear = EFFECTS["axis_nonorthogonality"]
+    given = scenario(effects=["axis_nonorthogonality:xy_rad=0.15"], gnss_std=0.01)
+    fitter, fit, _ = fitted(given, {shear.name: {}})
+    assert is_of_group(fitter.problem, fit, [shear], about) is is_some
+    none = fitter.fit(fit.hypothesis.with_effects([], 1, {}), fit.noise)
+    nothing, told = fit.columns[:, :, :0], 0.82 * (none.deviance - fit.deviance)
+    cause = looking.Unexplained(-50.0, about, nothing, nothing, told)
+    monkeypatch.setattr(looking, "find_unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(looking, "is_predictive", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(looking, "_held_out_gain", lambda *_: 1000.0)
+    left, _ = without_replaceable(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
+    assert bool(left.selected) == is_some
 
 
 @pytest.mark.parametrize(
