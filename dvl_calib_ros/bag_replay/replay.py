@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -483,12 +483,12 @@ def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]
     result = replayed.result
     estimated = [name for name in models if name in result.estimates]
     segments = []
-    with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
+    if result.first_ns is not None and result.last_ns is not None:
         ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
         segments = [
             {
-                "from_s": (segment.from_ns - result.first_ns) * 1e-9,  # type: ignore[operator]
-                "to_s": (end - result.first_ns) * 1e-9,  # type: ignore[operator]
+                "from_s": (segment.from_ns - result.first_ns) * 1e-9,
+                "to_s": (end - result.first_ns) * 1e-9,
                 "model": segment.model,
             }
             for segment, end in zip(result.segments, ends, strict=True)

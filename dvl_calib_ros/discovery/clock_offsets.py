@@ -95,11 +95,11 @@ def find_clocks(
     """
     if topics.gnss not in recording.columns or topics.dvl not in recording.columns:
         return None
-    found = [_find_in_recording(other, topics, parameters, knows_mounting, given) for other in recording.each]
+    found = [_find_in_recording(each, topics, parameters, knows_mounting, given) for each in recording.each]
     first = found[0]
-    if len(found) > 1 and any(other is not None and other.offsets.keys() & MOVING for other in found):
+    if len(found) > 1 and any(clocks is not None and clocks.offsets.keys() & MOVING for clocks in found):
         return None  # drift or step differ between recordings
-    if first is None or any(other is None for other in found):
+    if first is None or any(clocks is None for clocks in found):
         return None
     for other in found[1:]:
         assert other is not None

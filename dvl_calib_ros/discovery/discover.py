@@ -105,10 +105,10 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
 class _Search:
     """One search; the findings are collected in attributes."""
 
-    def __init__(self, seen: Survey, parameters: Parameters, given: Given, where: str) -> None:
-        self._survey, self._parameters, self._given, self._where = seen, parameters, given, where
+    def __init__(self, survey: Survey, parameters: Parameters, given: Given, where: str) -> None:
+        self._survey, self._parameters, self._given, self._where = survey, parameters, given, where
         used = parameters.use_transforms
-        self._tree = FrameTree.of(seen.transforms if used else (), seen.descriptions if used else ())
+        self._tree = FrameTree.of(survey.transforms if used else (), survey.descriptions if used else ())
         self._values: dict[str, Any] = {}
         self._found: list[str] = []
         self._notes: list[Reason] = list(self._tree.problems)

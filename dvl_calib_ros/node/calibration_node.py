@@ -248,9 +248,9 @@ class CalibrationNode(AnsweringNode):
         found = placement(self._transforms.tree(), frames, parameters, self._given)
         if found is None or parameters.replace(**found.values) == parameters:
             return
-        moved = parameters.replace(**{name: at for name, at in found.values.items() if name.endswith("_position")})
-        if parameters.replace(**found.values) == moved:  # a position alone changes no estimate
-            self._calibrator.set_parameters(moved)
+        positions = {name: at for name, at in found.values.items() if name in ("dvl_position", "reference_position")}
+        if parameters.replace(**found.values) == parameters.replace(**positions):  # these change no estimate
+            self._calibrator.set_parameters(parameters.replace(**positions))
             return
         self.info(f"{found.said}; the calibration starts with it (set use_transforms to false to ignore it)")
         self._restart(parameters.replace(**found.values))

@@ -79,8 +79,8 @@ class SlowNoise(NamedTuple):
 
     def squares(self, seconds: Array, metres: Array) -> Array:
         """Return the mean square of the drift (K,) m² over stretches of these durations (K,) s and lengths (K,) m."""
-        durations = seconds / self.memory_s
-        growth = 2.0 * self.memory_s**2 * (durations - 1.0 + np.exp(-durations))
+        ratio = seconds / self.memory_s
+        growth = 2.0 * self.memory_s**2 * (ratio - 1.0 + np.exp(-ratio))
         speed = metres / np.maximum(seconds, 1e-9)
         return np.asarray((2.0 * self.velocity**2 + (self.heading * speed) ** 2) * growth)
 

@@ -161,7 +161,7 @@ def _information(
     """Return the information (n, n) that a motion adds on a model's state, from its H and noise."""
     dvl_from_body = parameters.rotation_dvl_from_body
     ahead = np.column_stack([speed, np.zeros((len(speed), 2))])
-    (ca, sa), (cb, sb), zero = ((np.cos(yaw), np.sin(yaw)), (np.cos(pitch), np.sin(pitch)), np.zeros(len(yaw)))
+    (ca, sa), (cb, sb), zero = (np.cos(yaw), np.sin(yaw)), (np.cos(pitch), np.sin(pitch)), np.zeros(len(yaw))
     rotation = np.array([[ca * cb, -sa, ca * sb], [sa * cb, ca, sa * sb], [-sb, zero, cb]]).transpose(2, 0, 1)
     turning, pitching = np.gradient(yaw, STEP_S), np.gradient(pitch, STEP_S)
     rates = np.column_stack([-turning * np.sin(pitch), pitching, turning * np.cos(pitch)])

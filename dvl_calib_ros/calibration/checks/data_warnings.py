@@ -54,7 +54,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     if dvl["received"] >= FEWEST_SAMPLES and not dvl["accepted"]:
         reasons = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
         found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=reasons))
-    if _is_nothing_paired(counts):
+    if _none_is_paired(counts):
         found.append(finding("DVL_NO_REFERENCE"))
     if pairing["without_attitude"] > UNIMPORTANT_SHARE * dvl["received"]:
         found.append(finding("REFERENCE_NO_ATTITUDE", count=pairing["without_attitude"]))
@@ -78,7 +78,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     return found
 
 
-def _is_nothing_paired(counts: Mapping[str, Mapping[str, int]]) -> bool:
+def _none_is_paired(counts: Mapping[str, Mapping[str, int]]) -> bool:
     """Return whether enough valid DVL and reference samples arrived, but none could be paired."""
     reference, pairing = counts["reference"], counts["pairing"]
     usable = 2 * reference["received"] - sum(reference.values())

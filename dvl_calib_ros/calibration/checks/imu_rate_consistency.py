@@ -41,7 +41,7 @@ _NAMED_SIGNS = {(1, 1, -1): "HEADING_CLOCKWISE", (-1, -1, -1): "RATES_NEGATED", 
 
 
 def _conventions() -> Iterator[tuple[Reason, Array]]:
-    """Yield each exchange or negation of axes: its finding and B (3, 3), turn rate = B angular velocity. Likely first.
+    """Yield exchanges and negations of axes, likely ones first: finding and B (3, 3), turn rate = B angular velocity.
 
     On a level vehicle that only turns about z, many fit equally.
     """
@@ -92,7 +92,7 @@ class AttitudeRates:
         angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         w = (angles[last] - angles[first]) / seconds[:, None]
         is_short = seconds <= LONGEST_S
-        a, w, before, after = (a[is_short], w[is_short], before[is_short], after[is_short])
+        a, w, before, after = a[is_short], w[is_short], before[is_short], after[is_short]
         middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)

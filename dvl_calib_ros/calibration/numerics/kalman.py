@@ -256,7 +256,7 @@ def _with_unmeasured(x: Array, p: Array, measured: NDArray[np.intp], after: Gaus
     covariance = np.empty((*states.shape, x.shape[1]))
     cross = gain @ after.p
     covariance[..., measured[:, None], measured] = after.p
-    covariance[..., rest[:, None], measured], covariance[..., measured[:, None], rest] = (cross, cross.swapaxes(-1, -2))
+    covariance[..., rest[:, None], measured], covariance[..., measured[:, None], rest] = cross, cross.swapaxes(-1, -2)
     conditional = p[:, rest[:, None], rest] - gain @ (before - after.p) @ gain.swapaxes(1, 2)
     covariance[..., rest[:, None], rest] = 0.5 * (conditional + conditional.swapaxes(-1, -2))
     return GaussianState(states, covariance)

@@ -57,7 +57,6 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
     dvl_times, velocity = motion.dvl
     body = velocity @ rotation_dvl_from_body
     reference_times, reference = motion.reference_times, motion.reference
-
     known = (covered(reference_times, _steps(reference_times)), covered(dvl_times, _steps(dvl_times)))
     speeds = _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0]
     delay_s, is_far = lag(*speeds, *(mask.astype(float) for mask in known))

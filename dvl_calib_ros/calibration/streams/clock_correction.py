@@ -34,7 +34,6 @@ class Clocks:
     @staticmethod
     def of(parameters: Parameters) -> Clocks:
         """Return the delays of the parameters."""
-
         return Clocks(
             round(parameters.dvl_time_offset * SECOND_NS),
             round(parameters.reference_time_offset * SECOND_NS),
