@@ -76,6 +76,7 @@ class WaterHeard:
                 profile = QoSProfile(
                     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
                 )
+                # the callback is never called (NeverCalled): `hear` takes the newest message
                 self._subscriptions[topic, kind] = self._node.create_subscription(
                     class_, topic, lambda _: None, profile, callback_group=self._group
                 )

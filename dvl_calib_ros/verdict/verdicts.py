@@ -224,7 +224,7 @@ COMPARISONS = on_page(
     marginal(
         "MOUNTING_SUSPECTED",
         "suspected move: {name} is rejected ({why}), and differs from {other} {moved}",
-        means="A mounting that moved far is often rejected; σ of a reject does not hold.",
+        means="A mounting that moved far is often rejected, and the σ of a rejected calibration is not reliable.",
         remedy="inspect the mounting, and calibrate once more",
     ),
     marginal(
@@ -342,7 +342,7 @@ UNPAIRED = on_page(
         "SIMULATOR_ROUNDS_IN_VAIN",
         "corrected, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
         "held out; noise alone makes {floor:.1f}",
-        means="No round is better than the simulator as recorded.",
+        means="In no round was the corrected simulator closer to the vehicle than the simulator as recorded.",
     ),
     marginal(
         "SIMULATOR_NOT_ADDED",

@@ -206,7 +206,7 @@ class Displacements(Estimator):
         return (
             GaussianState(np.array([each.x for each in states]), np.array([each.p for each in states])),
             of_each,
-            2.0 * of_each,
+            2.0 * of_each,  # the expected sum of two components per sample: no innovations are kept
         )
 
     # ------------------------------------------------------------------ verification
