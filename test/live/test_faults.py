@@ -355,9 +355,9 @@ def test_publishers_and_subscribers_that_do_not_fit_are_named_with_what_is_wrong
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     neighbour.create_subscription(TwistWithCovarianceStamped, f"/{NODE}/calibrated_twist", print, latched)
     try:
-        message = node.wait_until_it_says("calibrated_twist: /hull/neighbour asks for an incompatible QoS").message
+        message = node.wait_until_it_says("calibrated_twist: /hull/neighbour requests an incompatible QoS").message
         assert "/dvl/twist: 2 publishers (" in message and "/hull/neighbour), where one is expected" in message
-        assert "/gnss/twist: /hull/neighbour publishes geometry_msgs/msg/TwistStamped, where" in message
+        assert "/gnss/twist: /hull/neighbour publishes geometry_msgs/msg/TwistStamped instead of" in message
     finally:
         neighbour.destroy_node()
         rclpy.shutdown(context=context)
