@@ -140,7 +140,7 @@ def apply(
     params, launch, fusion
         Parameter file of the node, launch file with a static transform, parameters of robot_localization.
     force
-        Also apply a calibration that is rejected, not converged, or of another mounting.
+        Also apply a calibration that is rejected, not converged, or found with another mounting.
     dry_run
         Write nothing; ``changes`` has the planned changes.
 

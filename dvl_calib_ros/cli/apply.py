@@ -53,8 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--send", metavar="HOST", help="send them to the instrument (waterlinked), and read them back")
     parser.add_argument("--dry-run", action="store_true", help="show old and new, write and send nothing")
     parser.add_argument(
-        "--force", action="store_true", help="apply a result that is rejected, not converged, or of another mounting"
-    )
+        "--force", action="store_true",
+        help="apply a result that is rejected, not converged, or found with another mounting",
+    )  # fmt: skip
     parser.add_argument(
         "--rollback",
         action="store_true",

@@ -187,7 +187,7 @@ def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER",
-        help="keep the DVL (round_1.json, for export and simulate --diagnosis) and bag (round_1) of every round",
+        help="write each round's simulated DVL (round_1.json, for export and simulate --diagnosis) and bag (round_1)",
     )  # fmt: skip
 
 

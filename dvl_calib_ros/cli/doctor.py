@@ -61,7 +61,7 @@ def _check_arguments(arguments: argparse.Namespace) -> None:
     """Raise InputError unless either bags or a valid live duration are given."""
     if bool(arguments.bags) == (arguments.live is not None):
         raise InputError(
-            "name a BAG, or the topics there are: --live" if not arguments.bags else "a BAG or --live, not both"
+            "name a BAG, or give --live for a running system" if not arguments.bags else "a BAG or --live, not both"
         )
     if arguments.live is not None and not 1.0 <= arguments.live <= 3600.0:
         raise InputError(f"--live: {arguments.live:g} is outside 1 .. 3600 s")

@@ -74,12 +74,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dvl-rate", type=float, default=5.0, metavar="HZ", help="default: %(default)g")
     parser.add_argument("--gnss-rate", type=float, default=5.0, metavar="HZ", help="default: %(default)g; 0: no GNSS")
     parser.add_argument("--imu-rate", type=float, default=20.0, metavar="HZ", help="default: %(default)g; 0: no IMU")
-    parser.add_argument("--beam-std", type=float, default=0.005, metavar="M/S", help="default: %(default)g per beam")
+    parser.add_argument("--beam-std", type=float, default=0.005, metavar="M/S", help="noise per beam (%(default)g)")
     parser.add_argument(
         "--beam-bias", nargs=4, type=float, default=(0.0,) * 4, metavar=("B1", "B2", "B3", "B4"),
         help="constant error of each beam, m/s",
     )  # fmt: skip
-    parser.add_argument("--gnss-std", type=float, default=0.1, metavar="M/S", help="default: %(default)g per axis")
+    parser.add_argument("--gnss-std", type=float, default=0.1, metavar="M/S", help="noise per axis (%(default)g)")
     parser.add_argument("--gnss-frame", choices=("enu", "body"), default="enu", help="default: %(default)s")
     parser.add_argument(
         "--gnss-outage", nargs=2, type=float, action="append", default=[], metavar=("FROM", "TO"),
@@ -256,7 +256,8 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     if arguments.follow is not None:
         for name in (*MOTION_OPTIONS, "speed"):
             if getattr(arguments, name) != getattr(defaults, name):
-                raise InputError(f"--{name.replace('_', '-')}: the motion comes from {arguments.follow}; leave it out")
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(f"{option}: the motion comes from {arguments.follow}; leave out {option}")
 
 
 def run_live(arguments: argparse.Namespace, scenario: Scenario) -> None:

@@ -105,10 +105,12 @@ def check_writable(path: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, ValueError) as error:
-        where = (
-            f"the folder {Path(os.path.realpath(path)).parent} is not writable" if "\0" not in str(path) else "no name"
-        )
-        raise InputError(f"{path}: {where} ({_error_text(error)}); name another") from error
+        if "\0" in str(path):
+            raise InputError(f"{path}: is no file name ({_error_text(error)}); name another file") from error
+        folder = Path(os.path.realpath(path)).parent
+        raise InputError(
+            f"{path}: the folder {folder} is not writable ({_error_text(error)}); name another folder"
+        ) from error
 
 
 def check_folder_writable(path: Path) -> None:

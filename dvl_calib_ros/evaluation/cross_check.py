@@ -189,8 +189,18 @@ def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Giv
         raise
     except Exception as error:
         failed = f"failed, and is in none of the figures: {Failure.of(error, 'replay')}"
-        nothing = np.full((len(models), 3, 3), np.nan)
-        return _Replayed(parameters, (), nothing, None, 0, (), {}, None, ("-", None), failed=(failed,))
+        return _Replayed(
+            parameters,
+            found=(),
+            corrections=np.full((len(models), 3, 3), np.nan),
+            moments=None,
+            n_paired=0,
+            notes=(),
+            delayed={},
+            recording=None,
+            selected=("-", None),
+            failed=(failed,),
+        )
 
 
 def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
@@ -234,10 +244,17 @@ def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Pat
         if (found := result.estimates[name]).used and any(found.state_of(beyond) for beyond in BEYOND)
     }
     selected = result.selected, _terms(result.estimate) if result.estimate.used else None
-    dvl = opened.recorded(topics.found_in(opened.types).dvl, parameters)
-    notes, recording = (*discovery.doubts, *replayed.notes), kept[0] if kept else None
     return _Replayed(
-        parameters, discovery.found, corrections, moments, n_paired, notes, delayed, recording, selected, dvl
+        parameters,
+        found=discovery.found,
+        corrections=corrections,
+        moments=moments,
+        n_paired=n_paired,
+        notes=(*discovery.doubts, *replayed.notes),
+        delayed=delayed,
+        recording=kept[0] if kept else None,
+        selected=selected,
+        dvl=opened.recorded(topics.found_in(opened.types).dvl, parameters),
     )
 
 

@@ -175,7 +175,7 @@ def _check_missing(folder: Path, missing: list[str], partial: bool) -> None:
     needed = [each.calibration_run for each in SETS]
     enough = not set(needed) & set(missing) and len(TRAJECTORIES) - len(missing) >= len(needed) + MIN_OTHERS
     if missing and not enough:
-        raise InputError(f"{folder}: {files} missing; it takes {', '.join(needed)} and {MIN_OTHERS} others at least")
+        raise InputError(f"{folder}: {files} missing; needs {', '.join(needed)} and {MIN_OTHERS} other trajectories")
     if missing and not partial:
         raise InputError(f"{folder}: {files} missing; fetch these files, or continue without them by --partial")
 

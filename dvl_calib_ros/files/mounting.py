@@ -465,8 +465,8 @@ def write_calibration(
 ) -> Applied:
     """Write a calibration into all files, or into none. Each previous file is kept as a backup.
 
-    force: also for a calibration that is rejected, not converged, or of another mounting. dry_run: write nothing,
-    return the planned changes. Raises InputError.
+    force: also for a calibration that is rejected, not converged, or found with another mounting. dry_run: write
+    nothing, return the planned changes. Raises InputError.
     """
     if targets.paths:
         calibrated.check_applicable(force)

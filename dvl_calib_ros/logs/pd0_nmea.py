@@ -83,6 +83,8 @@ def checksum_of(text: bytes) -> int:
 
 GENERAL_NMEA = 0x2022
 _HEAD = struct.Struct("<HHHd")  # data ID, specific ID, size of the message, time difference
+# A sentence belongs to the ensemble that holds it, so a larger time difference is no time, s.
+MAX_OFFSET_S = 3600.0
 _GGA, _VTG, _HDT = "GGA", "VTG", "HDT"
 _KINDS = {
     4: _GGA, 5: _VTG, 100: _GGA, 101: _VTG, 103: _HDT, 104: _GGA, 105: _VTG, 107: _HDT, 204: _GGA, 205: _VTG, 207: _HDT
@@ -110,10 +112,12 @@ class Nmea:
         except (struct.error, ValueError, IndexError):
             self.left_out["with NMEA that is damaged or empty"] += 1
             return
-        if abs(delta) < 3600.0 and np.isfinite(values).all():
-            self._found[kind].append((stamp_ns, delta, values))
-        else:
+        if not np.isfinite([delta, *values]).all():
             self.left_out["with NMEA that is damaged or empty"] += 1
+        elif abs(delta) >= MAX_OFFSET_S:
+            self.left_out["with NMEA an hour or more from the ensemble"] += 1
+        else:
+            self._found[kind].append((stamp_ns, delta, values))
 
     def references(self) -> list[ReferenceSample]:
         """Return horizontal velocities: from VTG, else from differences of GGA's positions."""

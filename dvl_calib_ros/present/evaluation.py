@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from ..calibration.assessment.dead_reckoning import Drift
 from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
@@ -335,29 +336,11 @@ DRIFT_NOTE = (
 
 def cross_check(check: CrossCheck) -> Document:
     """Lay out the errors of each bag's calibration on every other bag."""
-    pictures: list[Item] = []
-    for bag, name in zip(check.bags, check.names, strict=True):
-        by = {f"by {one}": check.navigation.get((each, bag)) for each, one in zip(check.bags, check.names, strict=True)}
-        found = {name: each for name, each in by.items() if each is not None}
-        if found:
-            one = next(iter(found.values()))
-            pictures.append(figures("replay_figures.navigation_pictures", one, found, f", {name}"))
-    head, nothing = ("calibrated on", "model", *check.names), ("nothing", "uncalibrated")
-    errors = [(*nothing, *(number(value, 4) for value in check.uncorrected.tolist()))]
-    for name, of_models in zip(check.names, check.corrected, strict=True):
-        for model, row in zip(check.models, of_models, strict=True):
+    heading, uncalibrated = ("calibrated on", "model", *check.names), ("nothing", "uncalibrated")
+    errors = [(*uncalibrated, *(number(value, 4) for value in check.uncorrected.tolist()))]
+    for name, by_model in zip(check.names, check.corrected, strict=True):
+        for model, row in zip(check.models, by_model, strict=True):
             errors.append((name, model, *(number(value, 4) for value in row.tolist())))
-    of_pairs = [[check.navigation.get((calibrated, bag)) for bag in check.bags] for calibrated in check.bags]
-    first = [next((each for each in of_bag if each is not None), None) for of_bag in zip(*of_pairs, strict=True)]
-    drifts = [("nothing", "as mounted", [each and each.before for each in first])]
-    drifts += [
-        (name, model, [each and each.after for each in of_bags])
-        for name, model, of_bags in zip(check.names, check.selected, of_pairs, strict=True)
-    ]
-    by_drift = [
-        (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in of_bags))
-        for name, model, of_bags in drifts
-    ]
     return Document(
         title="Bags checked against each other",
         subtitle=", ".join(check.names),
@@ -371,14 +354,46 @@ def cross_check(check: CrossCheck) -> Document:
             ),
             section(
                 "Dead reckoning on bags that were not calibrated on",
-                Table(head, by_drift if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
-                *pictures,
+                Table(heading, _drift_rows(check) if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
+                *_drift_pictures(check),
             ),
             section(
                 "Difference of DVL and GNSS on bags that were not calibrated on",
-                Table(head, errors, dense=True, notes=(ERRORS_NOTE,), words=2),
+                Table(heading, errors, dense=True, notes=(ERRORS_NOTE,), words=2),
             ),
             section("", *(Sentence(each, soft=True) for each in check.found)),
         ],
         parameters=check.parameters,
     )
+
+
+def _drift_rows(check: CrossCheck) -> list[tuple[str, ...]]:
+    """Return rows of calibrating bag, model, and the drift of each verifying bag; the first row without calibration."""
+    rows = []
+    as_mounted: dict[str, Drift] = {}  # hardly depends on the calibrating bag: the first one's
+    for calibrated, name, model in zip(check.bags, check.names, check.selected, strict=True):
+        navigations = [check.navigation.get((calibrated, verified)) for verified in check.bags]
+        rows.append((name, model, *(_drift_text(each.after if each else None) for each in navigations)))
+        for verified, navigation in zip(check.bags, navigations, strict=True):
+            if navigation is not None:
+                as_mounted.setdefault(verified, navigation.before)
+    return [("nothing", "as mounted", *(_drift_text(as_mounted.get(bag)) for bag in check.bags)), *rows]
+
+
+def _drift_text(drift: Drift | None) -> str:
+    return "–" if drift is None else f"{drift.per_km:.1f} ({drift.percent:.2g} %)"
+
+
+def _drift_pictures(check: CrossCheck) -> list[Item]:
+    """Return the map of each verifying bag, with the track by each other bag's calibration."""
+    pictures: list[Item] = []
+    for verified, name in zip(check.bags, check.names, strict=True):
+        tracks = {}
+        for calibrated, calibrated_name in zip(check.bags, check.names, strict=True):
+            navigation = check.navigation.get((calibrated, verified))
+            if navigation is not None:
+                tracks[f"by {calibrated_name}"] = navigation
+        if tracks:
+            uncorrected = next(iter(tracks.values()))  # hardly depends on the calibrating bag
+            pictures.append(figures("replay_figures.navigation_pictures", uncorrected, tracks, f", {name}"))
+    return pictures

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bags.columns import windows
+from ..bags.columns import Part, windows
 from ..bags.reader import BagReader
 from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
@@ -297,69 +297,81 @@ def _read(
     path: Path, bag: BagReader, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
 ) -> Recording:
     """Read a bag window by window: columns of moving topics, static transforms, descriptions, water readings."""
-    types = bag.topics
-    sensor_topics = {topic for topic, kind in types.items() if is_kept(kind)}
-    static_topics = {topic for topic, kind in types.items() if is_static(topic, kind)}
-    if topics is not None:
-        found = topics.found_in(types)
-        sensor_topics, static_topics = sensor_topics & {found.dvl, found.gnss, found.imu}, set()
-    water_collectors = {topic: WaterCollector(topic, kind) for topic, kind in types.items() if readers(topic, kind)}
-    one_by_one = (
-        static_topics
-        | {topic for topic in sensor_topics if not _is_read_in_columns(types[topic])}
-        | (water_collectors.keys() - sensor_topics)
-    )
-    counts = bag.message_counts
-    collectors = {
-        topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(sensor_topics)
-    }
-    still_to_read = dict.fromkeys(static_topics, MOST_STATIC)
-    transforms: list[Any] = []
-    descriptions: list[str] = []
+    found = _Contents(bag, topics, parameters)
     start_ns, end_ns = bag.span_ns
-    for window in windows(bag, sensor_topics | static_topics | water_collectors.keys(), one_by_one):
+    for window in windows(bag, found.topics, found.one_by_one):
         for part in window.parts:
-            topic = part.channel.topic
-            if topic in water_collectors:
-                for message, _ in islice(part.messages(), WATER_OF_WINDOW):
-                    if message is not None:
-                        water_collectors[topic].add(message)
-                if topic not in collectors:
-                    continue
-            if topic in collectors:
-                collectors[topic].take(part)
-                continue
-            for message, _ in islice(part.messages(), still_to_read[topic]):
-                still_to_read[topic] -= 1
-                if message is not None and types[topic] == TF_TYPE:
-                    transforms += list(message.transforms)
-                elif message is not None:
-                    descriptions.append(message.data)
+            found.take(part)
         on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
-    columns = {topic: collector.columns() for topic, collector in collectors.items()}
+    columns = {topic: collector.columns() for topic, collector in found.sensors.items()}
     for topic in _restamped(columns, parameters.restamp, path):
         columns[topic] = columns[topic].restamped()
     kept, file_spans_ns, far_findings = without_far(columns, bag.file_spans_ns)
+    types, counts = dict(bag.topics), bag.message_counts
     counts.subtract({topic: len(columns[topic]) - len(column) for topic, column in kept.items()})
     held = {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types}
-    imus = [column for column in kept.values() if column.msgtype == IMU_TYPE]
-    if not any(len(column.singles) or hold_orientations(column.laid.values) for column in imus):
-        for column in filter(None, map(orientations_of, list(kept.values()))):
-            kept[column.topic], counts[column.topic] = column, len(column)
-            types, held[column.topic] = {**types, column.topic: IMU_TYPE}, Held(frozenset({IMU_TYPE}), False)
+    for column in _poses_as_imus(kept.values()):
+        kept[column.topic], counts[column.topic] = column, len(column)
+        types[column.topic], held[column.topic] = IMU_TYPE, Held(frozenset({IMU_TYPE}), False)
     return Recording(
-        (path,),
-        types,
-        held,
-        counts,
-        file_spans_ns,
-        (*bag.notes, *map(str, far_findings)),
-        {topic: (column,) for topic, column in kept.items()},
-        tuple(transforms),
-        tuple(dict.fromkeys(descriptions)),
-        waters=tuple(reading for each in water_collectors.values() for reading in each.readings()),
+        paths=(path,),
+        types=types,
+        held=held,
+        counts=counts,
+        file_spans_ns=file_spans_ns,
+        notes=(*bag.notes, *map(str, far_findings)),
+        columns={topic: (column,) for topic, column in kept.items()},
+        transforms=tuple(found.transforms),
+        descriptions=tuple(dict.fromkeys(found.descriptions)),
+        waters=tuple(reading for each in found.waters.values() for reading in each.readings()),
         field_maps=_field_maps(bag),
     )
+
+
+class _Contents:
+    """Contents of a bag read so far.
+
+    topics: to be read. one_by_one: those of them whose messages do not fit columns. sensors, waters: collectors by
+    topic. transforms, descriptions: from the static topics.
+    """
+
+    def __init__(self, bag: BagReader, topics: Topics | None, parameters: Parameters) -> None:
+        """Select what to read. topics: the only ones to read; None for all useful ones."""
+        self._types, counts = bag.topics, bag.message_counts
+        sensor_topics = {topic for topic, kind in self._types.items() if is_kept(kind)}
+        static_topics = {topic for topic, kind in self._types.items() if is_static(topic, kind)}
+        if topics is not None:
+            named = topics.found_in(self._types)
+            sensor_topics, static_topics = sensor_topics & {named.dvl, named.gnss, named.imu}, set()
+        self.sensors = {
+            topic: Collector(topic, self._types[topic], counts[topic], parameters, bag.decoder)
+            for topic in sorted(sensor_topics)
+        }
+        self.waters = {t: WaterCollector(t, kind) for t, kind in self._types.items() if readers(t, kind)}
+        self._still_to_read = dict.fromkeys(static_topics, MOST_STATIC)
+        self.transforms: list[Any] = []
+        self.descriptions: list[str] = []
+        self.topics = sensor_topics | static_topics | self.waters.keys()
+        self.one_by_one = {
+            topic for topic in self.topics if topic not in sensor_topics or not _is_read_in_columns(self._types[topic])
+        }
+
+    def take(self, part: Part) -> None:
+        """Add the messages of one topic in a window."""
+        topic = part.channel.topic
+        if topic in self.waters:
+            for message, _ in islice(part.messages(), WATER_OF_WINDOW):
+                if message is not None:
+                    self.waters[topic].add(message)
+        if topic in self.sensors:
+            self.sensors[topic].take(part)
+        elif topic in self._still_to_read:
+            for message, _ in islice(part.messages(), self._still_to_read[topic]):
+                self._still_to_read[topic] -= 1
+                if message is not None and self._types[topic] == TF_TYPE:
+                    self.transforms += list(message.transforms)
+                elif message is not None:
+                    self.descriptions.append(message.data)
 
 
 def _restamped(columns: Mapping[str, TopicColumns], restamp: str, path: Path) -> list[str]:
@@ -432,6 +444,15 @@ def _map_types(bag: BagReader, text: str, where: str) -> None:
 RATE_WINDOW_S = 0.2
 # orientations whose components differ by no more than this are a constant filled in by the driver
 LEAST_CHANGE = 1e-4
+
+
+def _poses_as_imus(columns: Collection[TopicColumns]) -> list[TopicColumns]:
+    """Return the orientations of all topics of poses as IMUs; none if a recorded IMU may have an orientation."""
+    imus = [column for column in columns if column.msgtype == IMU_TYPE]
+    # messages without columns (singles) are not looked into
+    if any(len(column.singles) or hold_orientations(column.laid.values) for column in imus):
+        return []
+    return [imu for imu in map(orientations_of, columns) if imu is not None]
 
 
 def orientations_of(poses: TopicColumns) -> TopicColumns | None:

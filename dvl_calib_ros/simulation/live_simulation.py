@@ -96,7 +96,8 @@ class Follower:
     def _measure(self, after: float, until: float) -> None:
         """Measure the samples due in (after, until]."""
         is_gap = np.isfinite(after) and until - after > MAX_GAP_S
-        due = [(sensor, sensor.times(until)) for sensor in self._sensors]
+        # sensors also count the samples that a gap in the motion swallows
+        due = [(sensor, sensor.take_times(until)) for sensor in self._sensors]
         if is_gap or not any(len(at) for _, at in due):
             return
         window = list(self._window)
@@ -127,8 +128,8 @@ class _Sensor:
         self.make, self.rng, self.taken = make, rng, 0
         self._phase, self._step = phase, (phase + 1.0 / rate) - phase  # as numpy.arange counts
 
-    def times(self, until: float) -> Array:
-        """Return the sampling times (N,) s up to `until` that are still due."""
+    def take_times(self, until: float) -> Array:
+        """Return the sampling times (N,) s up to `until` that are still due, and count them as taken."""
         at = []
         while (time := self._phase + self.taken * self._step) <= until:
             at.append(time)

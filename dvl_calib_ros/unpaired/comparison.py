@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,18 +162,13 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
 
 def levels_by_regime(log: Log) -> dict[str, float]:
     """Return regime of motion -> m/s, root of the sum over axes of the squared noise level."""
-    scattered = scatter(log)
-    if not scattered or log.selection is None:
+    noise_samples = scatter(log)
+    if not noise_samples or log.selection is None:
         return {}
-    problem = log.selection.fitter.problem
-    values = np.concatenate([each.values for each in scattered])
-
-    class _AtSamples:
-        def __init__(self, motion: EffectInput) -> None:
-            self.motion = motion
-
-    motions = [_AtSamples(each.motion) for each in scattered]
-    masks = {"all": np.ones(len(values), dtype=bool)} | regimes(problem, motions, per_sample=True)  # type: ignore[arg-type]
+    values = np.concatenate([each.values for each in noise_samples])
+    masks = {"all": np.ones(len(values), dtype=bool)}
+    has_motion: Any = noise_samples  # per sample, `regimes` reads nothing but the motion
+    masks |= regimes(log.selection.fitter.problem, has_motion, per_sample=True)
     return {
         name: float(np.linalg.norm(robust_std(values[mask])))
         for name, mask in masks.items()

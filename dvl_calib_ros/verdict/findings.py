@@ -502,7 +502,7 @@ DOCTOR = on_page(
     warning(
         "DOCTOR_AXIS",
         "{topic}: {axes} is exactly zero in every message: not measured",
-        means="Course and speed have no vertical.",
+        means="A receiver that sends course and speed only measures no vertical velocity.",
         remedy="use a receiver's own velocity (three axes) if pitch matters",
     ),
     warning(
@@ -528,7 +528,7 @@ DOCTOR = on_page(
     error(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
-        remedy="let its driver convert to m/s; of a DVL, check the beam angle and the beam order as well",
+        remedy="let its driver convert to m/s; check the beam angle and the beam order of the DVL as well",
     ),
     error(
         "DOCTOR_DISAGREE",

@@ -173,13 +173,17 @@ def test_nmea_in_pd0_that_says_nothing_is_left_out_and_the_velocity_kept(tmp_pat
         general_nmea(204, sentence("GPGGA,103015.0,,,,,0,0,,,M,,M,,"), 0.0),
         general_nmea(105, b"$GPVTG\0" + bytes(3), 0.0),
         general_nmea(107, b"$HEHDT\0" + struct.pack("<d", math.nan), 0.0),
-        general_nmea(205, sentence("GPVTG,90.0,T,,M,2.0,N,,K,D"), 1e9),
+        general_nmea(205, sentence("GPVTG,90.0,T,,M,2.0,N,,K,D"), math.nan),
     ]
+    far = general_nmea(205, sentence("GPVTG,90.0,T,,M,2.0,N,,K,D"), 3600.0)
     other = general_nmea(206, sentence("SDDBT,9.0,f,3.0,M,1.0,F"), 0.0)
-    (tmp_path / "dive.PD0").write_bytes(b"".join(pd0(i, 100 * i, 0, 0, [*spoilt, other]) for i in range(5)))
+    (tmp_path / "dive.PD0").write_bytes(b"".join(pd0(i, 100 * i, 0, 0, [*spoilt, far, other]) for i in range(5)))
     log = read_dvl_log(tmp_path / "dive.PD0")
     assert len(log.samples) == 5 and not log.references
-    assert log.left_out == {"with NMEA that is damaged or empty": 5 * len(spoilt)}
+    assert log.left_out == {
+        "with NMEA that is damaged or empty": 5 * len(spoilt),
+        "with NMEA an hour or more from the ensemble": 5,
+    }
 
 
 def test_bottom_track_of_nortek_is_a_velocity_at_its_echo(tmp_path, capsys):
