@@ -24,6 +24,7 @@ from ..calibration.numerics.samples import (
     VelocityFrame,
     no_samples,
 )
+from ..calibration.streams.interpolation import linear_at
 from ..calibration.streams.screening import are_valid_velocities, unit_quaternions
 from ..errors import InputError
 from ..messages.decode import MessageDecoder
@@ -93,7 +94,7 @@ def recorded_motion(recording: MotionSource, rate_hz: float, seconds: float | No
     spline = RotationSpline(attitude_time, Rotation.from_quat(attitude))
     velocity = _in_body(samples, spline)
     at = start + time
-    on_grid = np.column_stack([np.interp(at, samples.velocity_time, column) for column in velocity.T])
+    on_grid = linear_at(samples.velocity_time, velocity, at)
     if recording.smoothing > 0.0:
         on_grid = gaussian_filter1d(on_grid, recording.smoothing * rate_hz, axis=0, mode="nearest")
     rotation = spline(at)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.numerics.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from ..calibration.streams.interpolation import linear_at
 from ..effects.base import ActsOn, EffectInput, Injection, at_dvl, late, traces, turns
 from ..messages.encode import SampleWriter
 from ..version import __version__
@@ -186,12 +187,12 @@ def truth_document(scenario: Scenario) -> dict[str, Any]:
 def dvl_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator) -> list[DvlSample]:
     """Simulate the DVL at times (N,) s."""
     moved = at_dvl(scenario.effects, world.input)
-    velocity = _interpolate(at, moved.time, moved.velocity_body)
+    velocity = linear_at(moved.time, moved.velocity_body, at)
     turn = turns(scenario.effects, moved)
-    turn = turn if turn.ndim == 1 else _interpolate(at, moved.time, turn)
+    turn = turn if turn.ndim == 1 else linear_at(moved.time, turn, at)
     measured = measure_dvl(velocity, scenario.errors, moved.rotation_dvl_from_body, rng, turn)
     added = traces(scenario.effects, moved, ActsOn.DVL) @ moved.rotation_dvl_from_body.T
-    measured = measured + _interpolate(at, moved.time, added)
+    measured = measured + linear_at(moved.time, added, at)
     measured = world.disturbed(measured, _input_at(world, at), ActsOn.DVL)
     covariance = axis_covariance(scenario.errors.beam_std) if scenario.errors.beam_std else None
     stamped = at + late(scenario.effects, ActsOn.DVL_CLOCK, at)
@@ -206,7 +207,7 @@ def gnss_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generato
     velocity = motion.velocity_body - traces(scenario.effects, world.input, ActsOn.REFERENCE)
     if scenario.gnss_frame is VelocityFrame.ENU:
         velocity = np.einsum("nij,nj->ni", motion.rotation_enu_from_body, velocity)
-    measured = measure_gnss(_interpolate(at, motion.time, velocity), scenario.gnss_std, rng)
+    measured = measure_gnss(linear_at(motion.time, velocity, at), scenario.gnss_std, rng)
     measured = world.disturbed(measured, _input_at(world, at), ActsOn.REFERENCE)
     covariance = np.eye(3) * scenario.gnss_std**2 if scenario.gnss_std else None
     stamped = at + late(scenario.effects, ActsOn.REFERENCE_CLOCK, at)
@@ -226,7 +227,7 @@ def imu_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator
     attitudes, rates = motion.rotation_enu_from_body[nearest], motion.angular_velocity[nearest]
     if not np.allclose(motion.time[nearest], at, rtol=0.0, atol=1e-9):
         attitudes = Slerp(motion.time, Rotation.from_matrix(motion.rotation_enu_from_body))(at).as_matrix()
-        rates = _interpolate(at, motion.time, motion.angular_velocity)
+        rates = linear_at(motion.time, motion.angular_velocity, at)
     if scenario.imu_errors != ImuErrors():
         attitudes, rates = measure_imu(attitudes, rates, scenario.imu_errors, rng)
     stamped = at + late(scenario.effects, ActsOn.ATTITUDE_CLOCK, at)
@@ -259,10 +260,6 @@ def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
 
 def _times(seconds: float, rate: float, phase: float) -> Array:
     return np.arange(phase, seconds - 1.0 / MOTION_RATE_HZ, 1.0 / rate)
-
-
-def _interpolate(at: Array, time: Array, values: Array) -> Array:
-    return np.column_stack([np.interp(at, time, column) for column in values.T])
 
 
 def _stamped(at: Array, values: Array) -> list[tuple[int, list[float]]]:

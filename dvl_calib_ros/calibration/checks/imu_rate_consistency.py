@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise, permutations
 from itertools import product as all_of
+from typing import NamedTuple
 
 import numpy as np
 
@@ -85,22 +86,15 @@ class AttitudeRates:
         if not pairs:
             return
         first, last = np.concatenate(pairs, axis=1)
-        seconds = times[last] - times[first]
-        before, after = orientation[first], orientation[last]
-        a = rotation_vector(quaternion_product(before * _INVERSE, after)) / seconds[:, None]
-        steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
-        angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        w = (angles[last] - angles[first]) / seconds[:, None]
-        is_short = seconds <= LONGEST_S
-        a, w, before, after = a[is_short], w[is_short], before[is_short], after[is_short]
-        middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
-        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-        body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
-        self._n += len(a)
+        is_short = times[last] - times[first] <= LONGEST_S
+        spans = _turn_rates(times, orientation, angular_velocity, first[is_short], last[is_short])
+        of_attitude, of_rates, body_from_enu = spans
+        self._n += len(of_attitude)
         self._tilted = self._tilted or bool((np.abs(body_from_enu[:, :2, 2]) > LEVEL_BELOW).any())
-        self._turning += a.T @ a
-        for frame, in_body in enumerate((w, product(body_from_enu, w), product(body_from_enu, w @ ENU_FROM_NED.T))):
-            self._both[frame] += a.T @ in_body
+        self._turning += of_attitude.T @ of_attitude
+        if_enu, if_ned = product(body_from_enu, of_rates), product(body_from_enu, of_rates @ ENU_FROM_NED.T)
+        for frame, in_body in enumerate((of_rates, if_enu, if_ned)):
+            self._both[frame] += of_attitude.T @ in_body
             self._rates[frame] += in_body.T @ in_body
 
     @property
@@ -152,6 +146,30 @@ class AttitudeRates:
         angle = math.degrees(math.acos(float(np.clip(0.5 * (np.trace(rotation) - 1.0), -1.0, 1.0))))
         if angle > TURNED_FROM_DEG and np.abs(rotation).max(axis=1).min() < EXCHANGED_FROM:
             yield _BODY, rotation, finding("RATES_TURNED", degrees=angle)
+
+
+class _TurnRates(NamedTuple):
+    """Mean turn rates (S, 3) rad/s over spans, by the attitude (body axes) and by the angular velocity (its axes).
+
+    body_from_enu: (S, 3, 3) attitude in the middle.
+    """
+
+    of_attitude: Array
+    of_rates: Array
+    body_from_enu: Array
+
+
+def _turn_rates(times: Array, orientation: Array, angular_velocity: Array, first: Index, last: Index) -> _TurnRates:
+    """Return the mean turn rates from samples `first` (S,) to `last` (S,). Streams: see `AttitudeRates.add`."""
+    seconds = (times[last] - times[first])[:, None]
+    before, after = orientation[first], orientation[last]
+    of_attitude = rotation_vector(quaternion_product(before * _INVERSE, after)) / seconds
+    steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
+    angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
+    return _TurnRates(of_attitude, (angles[last] - angles[first]) / seconds, body_from_enu)
 
 
 def _spans(times: Array) -> Index:

@@ -13,6 +13,7 @@ nearest in time: the DVL's fourth difference times r - d is -6 N (1 - κ) for an
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,32 +66,15 @@ class SharedNoise:
         step, reference_step = float(median(np.diff(times))), float(median(np.diff(reference_times)))
         if step > SLOWEST_S or reference_step > SLOWEST_REFERENCE_S:
             return
-        fourth = np.diff(velocity, ORDER, axis=0)
-        differences = fourth[_windows(_even(times, step), ORDER)]
+        differences = np.diff(velocity, ORDER, axis=0)[_windows(_even(times, step), ORDER)]
         self._later += [(differences[lag:] * differences[:-lag]).sum() for lag in _LATER]
         self._square += float((differences**2).sum())
-        # at the slower stream's times, with the nearest samples of the faster one
-        if reference_step > SLOWEST_S:
-            columns = np.column_stack([velocity, np.diff(velocity, 2, axis=0, prepend=np.nan, append=np.nan)])[2:-2]
-            orders = np.column_stack([columns, np.where(_evenly(times, step), fourth, np.nan)])
-            dvl, dvl_2, dvl_4 = np.split(_nearest(reference_times, step, times[2:-2], orders, -SHIFTS_S), 3, axis=2)
-            # equivalent to a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
-            other_4 = dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl)
-        elif reference_step < step:
-            even = _evenly(times, step)
-            dvl_4 = np.where(even, fourth, np.nan)
-            dvl_2 = np.diff(velocity, 2, axis=0)[1:-1]
-            other_4 = np.diff(_nearest(times, step, reference_times, reference, SHIFTS_S), ORDER, axis=1)
-        else:
-            other_4 = np.where(_evenly(reference_times, reference_step), np.diff(reference, ORDER, axis=0), np.nan)
-            dvl = _nearest(reference_times, reference_step, times, velocity, -SHIFTS_S)
-            dvl_4, dvl_2 = np.diff(dvl, ORDER, axis=1), np.diff(dvl, 2, axis=1)[:, 1:-1]
-        known = np.isfinite(dvl_4) & np.isfinite(other_4)
+        compared = _compared(times, step, velocity, reference_times, reference_step, reference)
+        known = np.isfinite(compared.dvl_4) & np.isfinite(compared.reference_4)
         count = np.count_nonzero(known, axis=(1, 2))
-        dvl_4, dvl_2, other_4 = (np.where(known, each, 0.0) for each in (dvl_4, dvl_2, other_4))
-        c_4, v_4, v_2 = np.stack([dvl_4 * other_4, dvl_4 * dvl_4, dvl_2 * dvl_2]).sum(axis=(2, 3)) / np.maximum(
-            count, 1
-        )
+        dvl_2, dvl_4, reference_4 = (np.where(known, each, 0.0) for each in compared)
+        products = np.stack([dvl_4 * reference_4, dvl_4 * dvl_4, dvl_2 * dvl_2])
+        c_4, v_4, v_2 = products.sum(axis=(2, 3)) / np.maximum(count, 1)
         is_enough = count >= (MIN_DIFFERENCES if reference_step <= SLOWEST_S else FEWEST_VALUES)
         sums = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * is_enough[:, None]
         self._stretches += is_enough
@@ -117,6 +101,40 @@ class SharedNoise:
         """Return the reason if the reference contains the DVL's noise."""
         share = self.share()
         return finding("REFERENCE_HOLDS_DVL", percent=100.0 * min(share, 1.0)) if share else None
+
+
+class _Compared(NamedTuple):
+    """Differences of simultaneous samples for S shifts, m/s: second and fourth of the DVL, fourth of the reference.
+
+    (S or 1, N, 3) each, nan where a sample is missing.
+    """
+
+    dvl_2: Array
+    dvl_4: Array
+    reference_4: Array
+
+
+def _compared(
+    times: Array, step: float, velocity: Array, reference_times: Array, reference_step: float, reference: Array
+) -> _Compared:
+    """Difference both streams at the slower one's times, with the nearest samples of the faster one.
+
+    times, reference_times: s, with usual steps. velocity, reference: see `SharedNoise.add`.
+    """
+    if reference_step > SLOWEST_S:
+        second = np.diff(velocity, 2, axis=0, prepend=np.nan, append=np.nan)
+        fourth = np.where(_evenly(times, step), np.diff(velocity, ORDER, axis=0), np.nan)
+        orders = np.column_stack([np.column_stack([velocity, second])[2:-2], fourth])
+        dvl, dvl_2, dvl_4 = np.split(_nearest(reference_times, step, times[2:-2], orders, -SHIFTS_S), 3, axis=2)
+        # equivalent to a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
+        return _Compared(dvl_2, dvl_4, dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl))
+    if reference_step < step:
+        dvl_4 = np.where(_evenly(times, step), np.diff(velocity, ORDER, axis=0), np.nan)
+        reference_4 = np.diff(_nearest(times, step, reference_times, reference, SHIFTS_S), ORDER, axis=1)
+        return _Compared(np.diff(velocity, 2, axis=0)[None, 1:-1], dvl_4[None], reference_4)
+    reference_4 = np.where(_evenly(reference_times, reference_step), np.diff(reference, ORDER, axis=0), np.nan)
+    dvl = _nearest(reference_times, reference_step, times, velocity, -SHIFTS_S)
+    return _Compared(np.diff(dvl, 2, axis=1)[:, 1:-1], np.diff(dvl, ORDER, axis=1), reference_4[None])
 
 
 def _about_mean(values: Array) -> Array:

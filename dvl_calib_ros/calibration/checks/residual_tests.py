@@ -29,6 +29,7 @@ from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, ROBUST_PASSES, median
 from ..numerics.samples import Index
 from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
 from ..results.results import OFFSETS, Estimate
+from ..streams.interpolation import linear_at
 from .beam_faults import BIAS_STD, BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
 from .reference_independence import SLOWEST_S
@@ -138,68 +139,157 @@ def residual_trend(
     """
     if len(time) < 3 or time[-1] - time[0] < FEWEST_VALUES * STRETCH_S:
         return None
+    seen = _Samples(time, rotation_enu_from_body, velocity - error, error, rates, interval_s)
     up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # -1 for a z-down body
     roll = np.arctan2(up * rotation_enu_from_body[:, 2, 1], up * rotation_enu_from_body[:, 2, 2])
     pitch = -np.arcsin(np.clip(rotation_enu_from_body[:, 2, 0], -1.0, 1.0))
-    changing = [_mean(time, tilt, TILT_S[0]) - _mean(time, tilt, TILT_S[1]) for tilt in (roll, pitch)]
-    body_from_enu = rotation_enu_from_body.swapaxes(1, 2)
-    # the DVL's smoothed velocity, because noise of either velocity would correlate with the residual
-    earth = _mean(time, _turned(rotation_enu_from_body, velocity - error), BEND_S)
-    before, after = _at(time, earth, -BEND_S), _at(time, earth, BEND_S)
-    moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
-    n = len(time)
-    yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
-    progress = (time - time.mean()) / (time[-1] - time[0])
-    heading_terms = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), progress])
-    fast_signals = np.zeros((n, 3, 3))
-    for axis in range(2):
-        tilt_axis = np.zeros((n, 3))
-        tilt_axis[:, axis] = -changing[axis]
-        fast_signals[:, :, axis] = cross(tilt_axis, moving)
-    # second derivative of means, so that DVL noise is common to all samples of a mean
-    turning = _mean(time, _turned(rotation_enu_from_body, _mean(time, velocity - error, MEAN_S)), BEND_S)
-    bend, whole_bend = (
-        (_at(time, each, BEND_S) - 2.0 * each + _at(time, each, -BEND_S)) / BEND_S**2 for each in (turning, earth)
+    changing_tilt = [_mean(time, tilt, TILT_S[0]) - _mean(time, tilt, TILT_S[1]) for tilt in (roll, pitch)]
+    smoothed = _smoothed_motion(seen)
+    fast = _fit_fast_signals(seen, smoothed, changing_tilt)
+    means = _fit_means(seen, smoothed)
+    if fast is None or means is None:
+        return None
+    tilt, tilt_std = fast.fit.x[-3:-1], fast.fit.std[-3:-1]
+    tilt_std[[each.std() < LEAST_TILT for each in changing_tilt]] = math.inf
+    # without tilt data, wave motion looks like turning
+    is_tilting = max(float(np.abs(each).max()) for each in changing_tilt) > LEVEL_BELOW
+    # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
+    is_observable = is_tilting and fast.bend_gain > LEAST_OF_BEND
+    circular = _noise_in_reference(seen, fast)
+    return ResidualTrend(
+        tilt=tilt,
+        tilt_std=tilt_std,
+        bias=means.bias.x[-3:],
+        bias_std=means.bias.std[-3:],
+        smoothed=float(fast.fit.x[-1] / fast.bend_gain) if is_observable else 0.0,
+        smoothed_std=float(fast.fit.std[-1] / fast.bend_gain) if is_observable else math.inf,
+        lean=np.array([roll.mean(), pitch.mean()]),
+        speed=math.sqrt(float((velocity**2).sum(axis=1).mean())),
+        circular=circular.share,
+        circular_std=circular.std,
+        circular_s=circular.memory_s,
+        over_ground=_over_ground(seen, means.bed),
+        over_ground_std=means.bed.std[OVER_GROUND],
+        turned=float(means.bias.x[-4]),
+        turned_std=float(means.bias.std[-4]),
     )
-    fast_signals[:, :, 2] = _turned(body_from_enu, bend)
+
+
+class _Samples(NamedTuple):
+    """N samples: time s, rotation_enu_from_body (N, 3, 3), corrected DVL velocity and error m/s, rates rad/s; body.
+
+    error: reference minus DVL. interval_s: sample interval of the reference, s.
+    """
+
+    time: Array
+    rotation_enu_from_body: Array
+    dvl: Array
+    error: Array
+    rates: Array
+    interval_s: float
+
+
+class _SmoothedMotion(NamedTuple):
+    """Smoothed DVL velocity (N, 3) m/s in ENU, the same and its slope in the body, and its bend in ENU.
+
+    bend: (N, 3) m/s³, second derivative. The smoothed DVL, because noise of either velocity would correlate with the
+    residual.
+    """
+
+    enu: Array
+    body: Array
+    slope_body: Array
+    bend: Array
+
+
+def _smoothed_motion(seen: _Samples) -> _SmoothedMotion:
+    """Smooth the DVL's velocity over BEND_S, and differentiate it over the same time."""
+    time, body_from_enu = seen.time, seen.rotation_enu_from_body.swapaxes(1, 2)
+    enu = _mean(time, _turned(seen.rotation_enu_from_body, seen.dvl), BEND_S)
+    slope = (linear_at(time, enu, time + BEND_S) - linear_at(time, enu, time - BEND_S)) / (2.0 * BEND_S)
+    return _SmoothedMotion(enu, _turned(body_from_enu, enu), _turned(body_from_enu, slope), _bend(time, enu))
+
+
+def _bend(time: Array, values: Array) -> Array:
+    """Return the second derivative of values (N, 3) by differences over BEND_S."""
+    before, after = linear_at(time, values, time - BEND_S), linear_at(time, values, time + BEND_S)
+    return np.asarray((after - 2.0 * values + before) / BEND_S**2)
+
+
+class _FastFit(NamedTuple):
+    """Fit of tilt and second derivative to all samples, with its columns (N, 3, n).
+
+    bend_gain: coefficient of the second derivative of means per unit of the whole second derivative.
+    """
+
+    fit: _Fit
+    columns: Array
+    bend_gain: float
+
+    def without_columns(self, values: Array) -> Array:
+        """Subtract the fit of the columns to values (N, 3)."""
+        weighted = self.fit.weight[:, None] * values
+        return np.asarray(values - self.columns @ (self.fit.p @ np.einsum("nij,ni->j", self.columns, weighted)))
+
+
+def _fit_fast_signals(seen: _Samples, smoothed: _SmoothedMotion, changing_tilt: Sequence[Array]) -> _FastFit | None:
+    """Fit roll, pitch (N,) rad and the second derivative of the velocity to all samples; None for too little data."""
+    time, body_from_enu = seen.time, seen.rotation_enu_from_body.swapaxes(1, 2)
+    signals = np.zeros((len(time), 3, 3))
+    for axis, tilt in enumerate(changing_tilt):
+        tilt_axis = np.zeros((len(time), 3))
+        tilt_axis[:, axis] = -tilt
+        signals[:, :, axis] = cross(tilt_axis, smoothed.body)
+    # second derivative of means, so that DVL noise is common to all samples of a mean
+    of_means = _mean(time, _turned(seen.rotation_enu_from_body, _mean(time, seen.dvl, MEAN_S)), BEND_S)
+    signals[:, :, 2] = _turned(body_from_enu, _bend(time, of_means))
+    whole_bend = _turned(body_from_enu, smoothed.bend)
     # linear interpolation loses this part of the second derivative on average
-    fast_residual = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
-    fast_columns = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), fast_signals], axis=2)
-    fast_fit = _fitted(time, fast_columns, fast_residual, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
-    bias_columns = np.broadcast_to(-np.eye(3), (n, 3, 3))
+    residual = seen.error - seen.interval_s**2 / 12.0 * whole_bend
+    nuisance = _nuisance_columns(smoothed.body, seen.rates, smoothed.slope_body, body_from_enu)
+    columns = np.concatenate([nuisance, signals], axis=2)
+    fit = _fitted(time, columns, residual, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
+    return None if fit is None else _FastFit(fit, columns, fit.last_coefficient(columns, whole_bend))
+
+
+class _MeanFits(NamedTuple):
+    """Fits to means over MEAN_S: of a DVL bias, and of the same with a moving bed."""
+
+    bias: _Fit
+    bed: _Fit
+
+
+def _fit_means(seen: _Samples, smoothed: _SmoothedMotion) -> _MeanFits | None:
+    """Fit bias, heading errors and moving bed to means over MEAN_S; None for too little data."""
+    time, rotation = seen.time, seen.rotation_enu_from_body
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
-    nuisance = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
+    moving = _neighbouring_means(time, smoothed.body, starts)
+    nuisance = _nuisance_columns(moving, seen.rates, smoothed.slope_body, rotation.swapaxes(1, 2))
+    yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+    progress = (time - time.mean()) / (time[-1] - time[0])
+    heading_terms = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), progress])
     by_heading = nuisance[:, :, -1, None] * heading_terms[:, None]
-    columns = np.concatenate([_means(each, starts) for each in (nuisance, by_heading, bias_columns)], axis=2)
+    by_bias = np.broadcast_to(-np.eye(3), (len(time), 3, 3))
+    columns = np.concatenate([_means(each, starts) for each in (nuisance, by_heading, by_bias)], axis=2)
+    data = _means(time, starts), columns, _means(seen.error, starts)
     prior_std = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
-    means = _means(time, starts), columns, _means(error, starts)
-    bias_fit = _fitted(*means, prior_std, LASTING)
+    bias = _fitted(*data, prior_std, LASTING)
     prior_std[OVER_GROUND] = BED_STD_MPS
-    bed_fit = _fitted(*means, prior_std, LASTING)
-    if fast_fit is None or bias_fit is None or bed_fit is None:
-        return None
-    over_ground = bed_fit.x[OVER_GROUND]
-    # on few headings yaw and bias can compensate any bed velocity, with a small residual
-    residual_over_ground = median(_turned(rotation_enu_from_body, error)[:, :2])
-    if float(over_ground @ residual_over_ground) < 0.5 * float(over_ground @ over_ground):
-        over_ground = np.zeros(2)
-    tilt, std = fast_fit.x[-3:-1], fast_fit.std[-3:-1]
-    std[[each.std() < LEAST_TILT for each in changing]] = math.inf
-    lean = np.array([roll.mean(), pitch.mean()])
-    speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
-    # without tilt data, wave motion looks like turning
-    is_observable = max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
-    # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
-    bend_gain = fast_fit.last_coefficient(fast_columns, _turned(body_from_enu, whole_bend))
-    is_observable = is_observable and bend_gain > LEAST_OF_BEND
-    smoothed = fast_fit.x[-1] / bend_gain if is_observable else 0.0
-    smoothed_std = fast_fit.std[-1] / bend_gain if is_observable else math.inf
-    return ResidualTrend(
-        tilt, std, bias_fit.x[-3:], bias_fit.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_noise_in_reference(time, velocity - error, error, fast_columns, fast_fit, interval_s), over_ground,
-        bed_fit.std[OVER_GROUND], float(bias_fit.x[-4]), float(bias_fit.std[-4]),
-    )  # fmt: skip
+    bed = _fitted(*data, prior_std, LASTING)
+    return None if bias is None or bed is None else _MeanFits(bias, bed)
+
+
+def _over_ground(seen: _Samples, bed: _Fit) -> Array:
+    """Return the velocity (2,) m/s of the bed, east and north; 0 if the residual holds less than half of it.
+
+    On few headings yaw and bias can compensate any bed velocity, with a small residual.
+    """
+    over_ground = bed.x[OVER_GROUND]
+    residual = median(_turned(seen.rotation_enu_from_body, seen.error)[:, :2])
+    if float(over_ground @ residual) < 0.5 * float(over_ground @ over_ground):
+        return np.zeros(2)
+    return over_ground
 
 
 def _nuisance_columns(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
@@ -279,16 +369,7 @@ def residual_warnings(
         severity = Severity.MARGINAL if by_position_window else Severity.REJECT
         # smoothing causes any other signal
         return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(severity)]
-    reasons = []
-    for axis, name in enumerate(("roll", "pitch")):
-        share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
-        if abs(share) > max(Z_SLOW_ERRORS * std, MISSING_TILT_SHARE):
-            error = abs(share * float(found.lean[axis]))
-            severity = Severity.REJECT if error > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
-            found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(error))
-            reasons.append(found_tilt.weighed(severity))
-        elif std > TILT_UNOBSERVABLE_STD and abs(float(found.lean[axis])) > accepted:
-            reasons.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
+    reasons = _tilt_warnings(found, accepted)
     # the heading at either end, relative to its mean
     error = 0.5 * abs(found.turned)
     if error > REPORTED_FROM_RAD and error > Z_ONE_TEST * found.turned_std:
@@ -297,6 +378,26 @@ def residual_warnings(
         reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(error)).weighed(severity))
     if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
         reasons += beam_warning(beam, max(accepted, second_order))
+    return reasons + _bias_warnings(found, mounting_std, accepted)
+
+
+def _tilt_warnings(found: ResidualTrend, accepted: float) -> list[Reason]:
+    """Return reasons for roll and pitch that the DVL's velocity does not follow, or may not. accepted: rad."""
+    reasons = []
+    for axis, name in enumerate(("roll", "pitch")):
+        share, std, lean = float(found.tilt[axis]), float(found.tilt_std[axis]), float(found.lean[axis])
+        if abs(share) > max(Z_SLOW_ERRORS * std, MISSING_TILT_SHARE):
+            error = abs(share * lean)
+            severity = Severity.REJECT if error > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
+            found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(error))
+            reasons.append(found_tilt.weighed(severity))
+        elif std > TILT_UNOBSERVABLE_STD and abs(lean) > accepted:
+            reasons.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(lean))))
+    return reasons
+
+
+def _bias_warnings(found: ResidualTrend, mounting_std: Sequence[float] | Array, accepted: float) -> list[Reason]:
+    """Return the reason for a significant bias, or for one speed that does not show it; see `residual_warnings`."""
     magnitude = np.abs(found.bias)
     is_significant = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
     if is_significant.any():
@@ -306,15 +407,14 @@ def residual_warnings(
             if is_significant[i]
         )
         angle = float(magnitude[is_significant].max()) / found.speed
-        is_wrong = (
-            magnitude - found.bias_std > np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * found.speed
-        )
-        severity = Severity.REJECT if (is_significant & is_wrong).any() else Severity.MARGINAL
-        reasons.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(angle)).weighed(severity))
-    elif float(found.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
+        allowed_mps = np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * found.speed
+        is_wrong = is_significant & (magnitude - found.bias_std > allowed_mps)
+        severity = Severity.REJECT if is_wrong.any() else Severity.MARGINAL
+        return [finding("DVL_BIAS", axes=axes, degrees=math.degrees(angle)).weighed(severity)]
+    if float(found.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
         share = TYPICAL_BIAS_MPS / found.speed
-        reasons.append(finding("ONE_SPEED", off=TYPICAL_BIAS_MPS, degrees=math.degrees(share), percent=100.0 * share))
-    return reasons
+        return [finding("ONE_SPEED", off=TYPICAL_BIAS_MPS, degrees=math.degrees(share), percent=100.0 * share)]
+    return []
 
 
 def _smoothed_one(found: ResidualTrend) -> str:
@@ -358,55 +458,58 @@ def _std(scatter: Array, group_sizes: Sequence[int]) -> Array:
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
-def _noise_in_reference(
-    time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit, interval_s: float
-) -> tuple[float, float, float]:
-    """Return the share of the DVL's noise that the reference keeps, its σ, and the memory, s.
+class _KeptNoise(NamedTuple):
+    """Share of the DVL's noise that the reference keeps after one sample, its σ, and the memory of the filter, s."""
 
-    dvl: (N, 3) m/s, body. interval_s: of the reference.
+    share: float
+    std: float
+    memory_s: float
+
+
+_NO_KEPT_NOISE = _KeptNoise(0.0, math.inf, 0.0)
+
+
+def _noise_in_reference(seen: _Samples, fast: _FastFit) -> _KeptNoise:
+    """Estimate the share of the DVL's noise in the reference, for the most significant memory of a filter.
 
     The innovation of a velocity, given its neighbours, holds its noise. The same filter is applied to the residual, so
     both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
-    step = float(median(np.diff(time)))
+    step = float(median(np.diff(seen.time)))
     # in slower streams the innovation is motion, and a reference that is interpolated follows the motion before
-    if max(step, interval_s) > SLOWEST_S or len(time) < 4 * NEIGHBOURS:
-        return 0.0, math.inf, 0.0
-    innovation, kept = (np.zeros_like(dvl) for _ in range(2))
-    for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):
+    if max(step, seen.interval_s) > SLOWEST_S or len(seen.time) < 4 * NEIGHBOURS:
+        return _NO_KEPT_NOISE
+    innovation, kept = (np.zeros_like(seen.dvl) for _ in range(2))
+    for axis, values in enumerate((seen.dvl - seen.dvl.mean(axis=0)).T):
         shares = _innovation_filter(values)
-        for past, each in ((innovation, values), (kept, error[:, axis])):
-            past[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
+        for filtered, each in ((innovation, values), (kept, seen.error[:, axis])):
+            filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
     limit = OUTLIER_RATIO * robust_std(innovation)
     # gaps break the prediction
-    is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
+    is_gap = np.append(0.0, np.abs(np.diff(seen.time) - step) > 0.5 * step)
     innovation[np.convolve(is_gap, np.ones(2 * NEIGHBOURS), "same") > 0.5] = 0.0
     noise = np.clip(innovation, -limit, limit)
-    weight = fit.weight * ((innovation == noise) & (innovation != 0.0)).all(axis=1)  # neither clipped, nor at an end
-
-    def without_columns(values: Array) -> Array:
-        weighted = fit.weight[:, None] * values
-        return np.asarray(values - columns @ (fit.p @ np.einsum("nij,ni->j", columns, weighted)))
-
-    current = without_columns(noise)
+    weight = fast.fit.weight * ((innovation == noise) & (innovation != 0.0)).all(axis=1)  # neither clipped, nor an end
+    current = fast.without_columns(noise)
     noise_power = np.maximum(np.einsum("n,ni,ni->i", weight, current, current), 1e-18)
 
-    def without_now(values: Array) -> Array:
+    def without_current(values: Array) -> Array:
+        """Subtract the part of values (N, 3) that follows the noise of the same sample."""
         return np.asarray(values - current * (np.einsum("n,ni,ni->i", weight, current, values) / noise_power))
 
-    kept, candidates = without_now(kept), []
+    kept, candidates = without_current(kept), []
     for seconds in FILTER_MEMORIES_S:
         for corrected_lag in (0.0, seconds):  # the lag may have been corrected as a delay
-            past = without_now(without_columns(_filtered_noise(noise, step, seconds, corrected_lag)))
+            past = without_current(fast.without_columns(_filtered_noise(noise, step, seconds, corrected_lag)))
             square = float(np.einsum("n,ni,ni->", weight, past, past))
             if square <= 0.0:
                 continue
             share = float(np.einsum("n,ni,ni->", weight, past, kept)) / square
-            scores = np.add.reduceat(weight * (past * (kept - share * past)).sum(axis=1), fit.starts)
+            scores = np.add.reduceat(weight * (past * (kept - share * past)).sum(axis=1), fast.fit.starts)
             std = math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES)
             if share - Z_95_PERCENT * std < 1.0:  # no filter makes more of the noise than there is: that is motion
-                candidates.append((share, std, seconds))
-    return max(candidates, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
+                candidates.append(_KeptNoise(share, std, seconds))
+    return max(candidates, key=lambda each: each.share / each.std, default=_NO_KEPT_NOISE)
 
 
 def _filtered_noise(noise: Array, step: float, seconds: float, corrected_lag: float) -> Array:
@@ -434,11 +537,6 @@ def _mean(time: Array, values: Array, seconds: float) -> Array:
     sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     number = (end - first).reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray((sums[end] - sums[first]) / number)
-
-
-def _at(time: Array, values: Array, later: float) -> Array:
-    """Interpolate values (N, 3) at times (N,) shifted by `later` (s)."""
-    return np.column_stack([np.interp(time + later, time, column) for column in values.T])
 
 
 def _means(values: Array, starts: Index) -> Array:

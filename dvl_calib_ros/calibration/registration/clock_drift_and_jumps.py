@@ -86,8 +86,9 @@ class ClockChange:
         near = np.abs(fit.times[shared] - self.at) <= reach_s
         if not near.any():
             return self
-        best = int(np.argmin(np.cumsum((costs_before[in_before] - costs_after[in_after])[near])))
-        seconds = float(fit.times[shared][near][best])
+        # a step after the first n references costs this sum over them, plus a constant
+        cost_of_step_after = np.cumsum((costs_before[in_before] - costs_after[in_after])[near])
+        seconds = float(fit.times[shared][near][int(np.argmin(cost_of_step_after))])
         # converted to DVL stamps, midway between those before and after a forward step
         return replace(self, at=seconds + (float(state[DELTA]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
 
@@ -172,29 +173,31 @@ def unsteady(
     names = DIRECTIONS if is_turned else {"dvl": DIRECTIONS["dvl"]}
     n, everywhere = np.arange(len(times)), np.ones(len(times), dtype=bool)
     no_change = np.zeros((len(times), len(indices)))
-    chi2_unchanged = _fit_change(states, weights, no_change, everywhere)[0]
-    chi2_without_one = [_fit_change(states, weights, no_change, n != left_out)[0] for left_out in n]
+    chi2_unchanged = _fit_change(states, weights, no_change, everywhere).chi2
+    chi2_without_one = [_fit_change(states, weights, no_change, n != left_out).chi2 for left_out in n]
     found = []
     for pattern in (_ChangePattern(times, everywhere, None), *_step_patterns(times)):
         for name, direction in names.items():
             change = np.outer(pattern.delays, (0.0, 0.0, 0.0, *direction))
-            chi2, value, std = _fit_change(states, weights, change, pattern.is_fixed)
-            chi2 += FREE_DELAY_CHI2 * (not pattern.is_fixed.all())
-            if pattern.is_possible(value, streams.get(name) if is_turned else None, _reach(times)):
-                found.append((chi2, value, std, name, pattern))
-    chi2, value, std, name, pattern = min(found, key=lambda each: each[0])
-    length = float(np.ptp(times)) if pattern.at is None else 1.0
+            fit = _fit_change(states, weights, change, pattern.is_fixed)
+            if not pattern.is_fixed.all():
+                fit = fit._replace(chi2=fit.chi2 + FREE_DELAY_CHI2)
+            if pattern.is_possible(fit.value, streams.get(name) if is_turned else None, _reach(times)):
+                found.append(_ClockHypothesis(name, pattern, fit))
+    best = min(found, key=lambda each: each.fit.chi2)
+    chi2, value, at = best.fit.chi2, best.fit.value, best.pattern.at
+    length = float(np.ptp(times)) if at is None else 1.0
     # noise as long as a stretch adds scatter, so all evidence is scaled down
     scatter = max(1.0, chi2 / (states.size - len(indices) - 1.0))
-    std *= math.sqrt(scatter)
+    std = best.fit.std * math.sqrt(scatter)
     is_large = abs(value) * length > REPORTED_FROM_S and abs(value) > Z_SLOW_ERRORS * std
     is_significant = is_large and chi2_unchanged - chi2 > MIN_CHI2_GAIN * scatter
     is_one_bad_stretch = chi2 > min(chi2_without_one) + FREE_DELAY_CHI2 * scatter
     if not is_significant or is_one_bad_stretch or scatter > MAX_CHI2_LEFT:
         return None
-    chi2_other_clocks = min((cost for cost, _, _, other, _ in found if other != name), default=np.inf)
-    whose = name if is_turned and chi2_other_clocks - chi2 > RULED_OUT * scatter else ""
-    return ClockChange(whose, value, std=std) if pattern.at is None else ClockChange(whose, 0.0, value, pattern.at, std)
+    chi2_other_clocks = min((each.fit.chi2 for each in found if each.clock != best.clock), default=np.inf)
+    whose = best.clock if is_turned and chi2_other_clocks - chi2 > RULED_OUT * scatter else ""
+    return ClockChange(whose, value, std=std) if at is None else ClockChange(whose, leap=value, at=at, std=std)
 
 
 def _step_patterns(times: Array) -> Iterator[_ChangePattern]:
@@ -206,8 +209,27 @@ def _step_patterns(times: Array) -> Iterator[_ChangePattern]:
             yield _ChangePattern((n > at).astype(float), n != at, float(times[at]))
 
 
-def _fit_change(states: Array, weights: Array, change: Array, used: Mask) -> tuple[float, float, float]:
-    """Fit a common state plus `change` (S, k) · value to states (S, k). Return residual chi-square, value and its σ."""
+class _ChangeFit(NamedTuple):
+    """Residual chi-square of a fit, and size of the change with its σ: a drift, s/s, or a step, s."""
+
+    chi2: float
+    value: float
+    std: float
+
+
+class _ClockHypothesis(NamedTuple):
+    """Change of one clock (key of `DIRECTIONS`) with one pattern, fitted."""
+
+    clock: str
+    pattern: _ChangePattern
+    fit: _ChangeFit
+
+
+def _fit_change(states: Array, weights: Array, change: Array, used: Mask) -> _ChangeFit:
+    """Fit a common state (k,) plus `change` (S, k) · value to the states (S, k) of the `used` (S,) stretches.
+
+    weights: (S, k, k) inverse covariances. change: per unit of the value. Without a change among them: value 0, σ inf.
+    """
     k = states.shape[1]  # unknowns: the common state (k), then the value
     design = np.concatenate([np.broadcast_to(np.eye(k), (len(states), k, k)), change[:, :, None]], axis=2)[used]
     observed, used_weights = states[used], weights[used]
@@ -218,4 +240,6 @@ def _fit_change(states: Array, weights: Array, change: Array, used: Mask) -> tup
     estimate = p @ np.einsum("sij,sik,sk->j", design, used_weights, observed)[:n_unknowns]
     residual = observed - design[:, :, :n_unknowns] @ estimate
     chi_square = float(np.einsum("si,sij,sj->", residual, used_weights, residual))
-    return (chi_square, float(estimate[k]), float(np.sqrt(p[k, k]))) if is_observable else (chi_square, 0.0, np.inf)
+    if not is_observable:
+        return _ChangeFit(chi_square, 0.0, np.inf)
+    return _ChangeFit(chi_square, float(estimate[k]), float(np.sqrt(p[k, k])))

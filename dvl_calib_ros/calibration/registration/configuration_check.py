@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,7 +36,10 @@ MAX_SPREAD_RATIO = 0.25
 
 
 class Directions:
-    """Sums of horizontal directions as unit complex numbers, in constant memory."""
+    """Sums of horizontal directions as unit complex numbers, in constant memory.
+
+    Directions of travel as given (nominally in the body) and relative to the heading, as if they were in ENU or NED.
+    """
 
     def __init__(self) -> None:
         self._n = 0
@@ -54,6 +58,7 @@ class Directions:
         self._heading += complex(heading.sum())
 
     def _length(self, total: complex) -> float:
+        """Return the mean resultant length (0..1) from a sum of unit numbers: 1 if all directions are equal."""
         return abs(total) / self._n if self._n >= FEWEST_OF_MOTION else math.nan
 
     @property
@@ -62,10 +67,11 @@ class Directions:
 
         NED needs several headings: a vehicle that yaws in waves on a straight course looks like NED.
         """
-        of_body, of_enu, of_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
-        if of_enu < 1.0 - RESULTANT_LIMIT and of_enu < MAX_SPREAD_RATIO * of_body:
+        spread_body, spread_enu, spread_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
+        max_spread = 1.0 - RESULTANT_LIMIT
+        if spread_enu < max_spread and spread_enu < MAX_SPREAD_RATIO * spread_body:
             return True
-        return self._headings_are_several and of_ned < 1.0 - RESULTANT_LIMIT and of_ned < MAX_SPREAD_RATIO * of_body
+        return self._headings_are_several and spread_ned < max_spread and spread_ned < MAX_SPREAD_RATIO * spread_body
 
     @property
     def stay_in_the_body(self) -> bool:
@@ -136,28 +142,42 @@ def fitting_configuration(
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
         max_ratio = min(MAX_SIGN_RATIO, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
         return wrong_axes(motion, curves, nominal, lever_arm, max_ratio * given.spread, parameters.dvl_axes, SIGNS)
-    fits: dict[VelocityFrame, Fitted] = {}
-    also_turned = set()
+    fits = {}
     for frame in _FRAMES:
-        fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS)
-        # mountings with a name, and a free one
-        likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
-        give_up_above = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
-        candidates = [nearest(fit, rotation, most=give_up_above) for rotation in likely]
-        if (turned := candidates[1]) is not None and misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
-            also_turned.add(frame)
-        if fitted := [each for each in candidates if each is not None]:
-            fits[frame] = min(fitted, key=lambda each: each.level)
+        in_frame = _fit_in_frame(MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS), nominal)
+        if in_frame is not None:
+            fits[frame] = in_frame
     if not fits:
         return None
     # of two similar fits the configured frame is likelier
-    best = min(fits, key=lambda frame: fits[frame].residual * (math.sqrt(0.5) if frame is declared else 1.0))
-    if fits[best].residual > min(FITS_BELOW, BETTER_BY * min(misfit_as_given, 1.0)):
+    best = min(fits, key=lambda frame: fits[frame].fit.residual * (math.sqrt(0.5) if frame is declared else 1.0))
+    fit = fits[best].fit
+    if fit.residual > min(FITS_BELOW, BETTER_BY * min(misfit_as_given, 1.0)):
         return None
-    wrong = wrong_axes(motion, curves, nominal, lever_arm, fits[best].level, parameters.dvl_axes)
+    wrong = wrong_axes(motion, curves, nominal, lever_arm, fit.level, parameters.dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
-    return _configuration_finding(declared, best, fits[best].rotation_body_from_dvl, parameters, best in also_turned)
+    return _configuration_finding(declared, best, fit.rotation_body_from_dvl, parameters, fits[best].also_turned)
+
+
+class _FrameFit(NamedTuple):
+    """Best fit with the reference in one frame. also_turned: body axes rotated about x by 180° fit as well."""
+
+    fit: Fitted
+    also_turned: bool
+
+
+def _fit_in_frame(fit: MotionFit, nominal: Array) -> _FrameFit | None:
+    """Return the best fit of the configured mounting, of it with body or DVL axes rotated, and of a free one."""
+    body_turned, dvl_turned = FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD
+    give_up_above = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
+    by_mounting = [nearest(fit, start, most=give_up_above) for start in (nominal, body_turned, dvl_turned, None)]
+    fitted = [each for each in by_mounting if each is not None]
+    if not fitted:
+        return None
+    turned = by_mounting[1]
+    also_turned = turned is not None and misfit(turned, body_turned) < FITS_BELOW
+    return _FrameFit(min(fitted, key=lambda each: each.level), also_turned)
 
 
 def nearest(
@@ -220,20 +240,13 @@ def wrong_axes(
     """
     ahead = int(np.argmax((motion.dvl.velocity**2).sum(axis=0)))
     others = [axis for axis in range(3) if axis != ahead]
-    found: list[tuple[float, Array, Fitted]] = []
-    for pattern in patterns:
-        signs = pattern[np.argsort([ahead, *others])]
-        quick_rows = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), QUICK_ROWS)
-        give_up_above = min([FAR_ABOVE * MAX_QUICK_RATIO * most, *(level for level, *_ in found)])
-        near = nearest(quick_rows, nominal, (REFERENCE,), give_up_above)
-        # a fit that rotates the axes back is the configured pattern
-        if near is not None and _significant_angle(near.rotation_body_from_dvl, nominal, near.std[TURN]) < MISALIGNED:
-            found.append((near.level, signs, near))
-    if not found:
+    all_signs = [pattern[np.argsort([ahead, *others])] for pattern in patterns]
+    best = _best_signs(motion, curves, nominal, lever_arm, all_signs, FAR_ABOVE * MAX_QUICK_RATIO * most)
+    if best is None:
         return None
-    _, signs, near = min(found, key=lambda each: each[0])
+    signs = best.signs
     fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FULL_ROWS)
-    fitted = fit(0.0, near.dvl_delay_s, nominal, (REFERENCE,))
+    fitted = fit(0.0, best.fit.dvl_delay_s, nominal, (REFERENCE,))
     if fitted is None:
         return None
     factors, std, level = fit.axis_factors(fitted, nominal)
@@ -259,6 +272,33 @@ def wrong_axes(
         factor = float(factors[ahead] / factors[scaled])
         return finding("DVL_AXIS_SCALED", axis="xyz"[scaled], factor=factor, other="xyz"[ahead])
     return None
+
+
+class _SignFit(NamedTuple):
+    """Quick fit of a DVL whose axes have these signs (3,)."""
+
+    signs: Array
+    fit: Fitted
+
+
+def _best_signs(
+    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, all_signs: Sequence[Array], most: float
+) -> _SignFit | None:
+    """Return the signs that fit best near the nominal mounting (3, 3), or None.
+
+    most: residual (m/s) above which a fit that hardly improves is given up.
+    """
+    best: _SignFit | None = None
+    for signs in all_signs:
+        quick_rows = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), QUICK_ROWS)
+        fit = nearest(quick_rows, nominal, (REFERENCE,), most if best is None else min(most, best.fit.level))
+        if fit is None:
+            continue
+        # a fit that rotates the axes back is the configured pattern
+        is_near = _significant_angle(fit.rotation_body_from_dvl, nominal, fit.std[TURN]) < MISALIGNED
+        if is_near and (best is None or fit.level < best.fit.level):
+            best = _SignFit(signs, fit)
+    return best
 
 
 def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:

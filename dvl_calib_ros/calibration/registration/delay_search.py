@@ -14,7 +14,7 @@ import numpy as np
 
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from ..streams.interpolation import REACH_INTERVALS, attitude_at
+from ..streams.interpolation import REACH_INTERVALS, attitude_at, linear_at
 from .motion_streams import MotionStreams
 
 # Largest searched delay, s.
@@ -62,7 +62,8 @@ def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None
 
 def _minima(misfit: Array, by_reference: Array, by_dvl: Array, count: int) -> list[DelayPair]:
     """Return the `count` lowest local minima of a misfit (R, D) over reference and DVL delays (R,) and (D,), s."""
-    padded = np.pad(misfit, 1, constant_values=np.inf)  # only local minima, so that flanks of a broad one do not count
+    # only local minima, so that flanks of a broad one do not count
+    padded = np.pad(misfit, 1, constant_values=np.inf)
     is_lowest = np.minimum(misfit, np.minimum(padded[2:, 1:-1], padded[:-2, 1:-1])) == misfit
     is_lowest &= np.minimum(misfit, np.minimum(padded[1:-1, 2:], padded[1:-1, :-2])) == misfit
     misfit = np.where(is_lowest, misfit, np.inf)
@@ -78,16 +79,25 @@ def _minima(misfit: Array, by_reference: Array, by_dvl: Array, count: int) -> li
     return found
 
 
-def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Array]:
-    """Return delays (L,) s, and the misfit (L or 1, L) by reference delay and DVL delay."""
+class _Misfits(NamedTuple):
+    """Delays (L,) s, and the misfit by reference delay (rows) and DVL delay, (L, L).
+
+    (1, L) if only the DVL delay is observable.
+    """
+
+    delays: Array
+    misfit: Array
+
+
+def _misfits(motion: MotionStreams, rotation: Array | None) -> _Misfits:
+    """Return the misfit at all pairs of delays up to `FARTHEST_S`; inf where too little overlaps."""
     step, grid = _grid(motion)
     max_shift = round(FARTHEST_S / step)
     delays = step * np.arange(-max_shift, max_shift + 1)
     dvl = _on_grid(motion.dvl.times, motion.dvl.velocity, grid, step)
     reference = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
-    n_steps = len(grid)
-    size = 1 << (n_steps + 2 * max_shift - 1).bit_length()
-    dvl_spectra = np.fft.rfft(np.column_stack([dvl.values, dvl.known, dvl.squares]), size, axis=0)
+    size = 1 << (len(grid) + 2 * max_shift - 1).bit_length()
+    dvl_spectra = _spectra(dvl, size)
     min_count = max(MIN_OVERLAP * min(dvl.known.sum(), reference.known.sum()), MIN_OVERLAP_S / step)
     attitude: Array | None = None
     if motion.in_earth and motion.has_attitude:
@@ -100,26 +110,50 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
             known = body.known * oriented
             values = np.einsum("nji,nj->ni", attitude, body.values) * known[:, None]
             body = _Series(values, known, body.squares * known)
-        conjugate = np.conj(np.fft.rfft(np.column_stack([body.values, body.known, body.squares]), size, axis=0))
-        # Σ_t body(t) dvl(t + lag): count, squares of each where the other is known, products of all components
-        products = [conjugate[:, i] * dvl_spectra[:, j] for i, j in ((3, 3), (3, 4), (4, 3))]
-        if rotation is not None:
-            aligned = conjugate[:, :3] * (dvl_spectra[:, :3] @ rotation.T)
-            products.append(aligned.sum(axis=1))
-        else:
-            products += [conjugate[:, i] * dvl_spectra[:, j] for i in range(3) for j in range(3)]
-        sums = np.fft.irfft(np.array(products), size, axis=1)
-        sums = np.concatenate([sums[:, -max_shift:], sums[:, : max_shift + 1]], axis=1)
-        count, squares = sums[0], sums[1] + sums[2]
-        if rotation is not None:
-            correlation = sums[3]
-        else:
-            matrices = sums[3:].T.reshape(-1, 3, 3)
-            # the best orthogonal matrix: either handedness will do for a search
-            correlation = np.linalg.svd(matrices, compute_uv=False).sum(axis=1)
-        is_enough = (count >= min_count) & (squares > 0.0)
-        misfit[row, is_enough] = (squares - 2.0 * correlation)[is_enough] / (0.5 * squares[is_enough])
-    return delays, np.maximum(misfit, 0.0)
+        sums = _sums_over_lags(_spectra(body, size), dvl_spectra, rotation, size, max_shift)
+        is_enough = (sums.n_steps >= min_count) & (sums.squares > 0.0)
+        left = sums.squares - 2.0 * sums.correlation
+        misfit[row, is_enough] = left[is_enough] / (0.5 * sums.squares[is_enough])
+    return _Misfits(delays, np.maximum(misfit, 0.0))
+
+
+def _spectra(series: _Series, size: int) -> Array:
+    """Return the Fourier transforms (F, 5) of three components, known and squares, padded to `size` steps."""
+    return np.asarray(np.fft.rfft(np.column_stack([series.values, series.known, series.squares]), size, axis=0))
+
+
+class _LagSums(NamedTuple):
+    """Sums over the overlap of body and DVL series at each lag (L,).
+
+    n_steps: number of steps. squares: Σ|B|² + Σ|v|². correlation: tr(C Σ v Bᵀ).
+    """
+
+    n_steps: Array
+    squares: Array
+    correlation: Array
+
+
+def _sums_over_lags(body: Array, dvl: Array, rotation: Array | None, size: int, max_shift: int) -> _LagSums:
+    """Return the sums over body(t) and dvl(t + lag) for lags up to `max_shift` steps, from their spectra (F, 5).
+
+    rotation: (3, 3) C; None for the best one at each lag.
+    """
+    conjugate = np.conj(body)
+    # count, squares of each where the other is known, then products of the components
+    products = [conjugate[:, i] * dvl[:, j] for i, j in ((3, 3), (3, 4), (4, 3))]
+    if rotation is not None:
+        aligned = conjugate[:, :3] * (dvl[:, :3] @ rotation.T)
+        products.append(aligned.sum(axis=1))
+    else:
+        products += [conjugate[:, i] * dvl[:, j] for i in range(3) for j in range(3)]
+    sums = np.fft.irfft(np.array(products), size, axis=1)
+    sums = np.concatenate([sums[:, -max_shift:], sums[:, : max_shift + 1]], axis=1)
+    if rotation is not None:
+        correlation = sums[3]
+    else:
+        # the best orthogonal matrix: either handedness will do for a search
+        correlation = np.linalg.svd(sums[3:].T.reshape(-1, 3, 3), compute_uv=False).sum(axis=1)
+    return _LagSums(sums[0], sums[1] + sums[2], correlation)
 
 
 def _grid(motion: MotionStreams) -> tuple[float, Array]:
@@ -143,7 +177,7 @@ def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
         return _Series(np.zeros((len(grid), 3)), np.zeros(len(grid)), np.zeros(len(grid)))
     is_near = mean_times[after] - mean_times[after - 1] <= longest_gap
     known = ((grid >= mean_times[0]) & (grid <= mean_times[-1]) & is_near).astype(float)
-    values = np.column_stack([np.interp(grid, mean_times, column) for column in means.T]) * known[:, None]
+    values = linear_at(mean_times, means, grid) * known[:, None]
     return _Series(values, known, (values * values).sum(axis=1))
 
 

@@ -32,11 +32,11 @@ from ..numerics.frames import (
 from ..numerics.robust import FEWEST_VALUES
 from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import enu_from, quaternion_product
-from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
+from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at, linear_at
 from .configuration_check import BETTER_BY, DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, MIN_SPEED_MPS, QUICK_ROWS, REFERENCE, MotionFit, white_noise
 from .motion_streams import Curves, MotionStreams
-from .unregistrable_clocks import covered, velocity_at
+from .unregistrable_clocks import covered
 
 # Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a
 # vehicle that only moves ahead) and changes observable ones by less than 0.1 degrees.
@@ -159,7 +159,7 @@ class Readings:
         if motion.has_attitude:
             use &= attitude_at(motion.imu, times, GAP_S)[1]
         self._at, self._dvl = times[use], dvl[use]
-        self._reference = velocity_at(motion.reference_times, motion.reference, self._at)
+        self._reference = linear_at(motion.reference_times, motion.reference, self._at)
 
     def __len__(self) -> int:
         """Return the number of simultaneous velocities."""
@@ -196,7 +196,7 @@ class Readings:
             motion = self._read(reading)
             if motion is None:
                 continue
-            body = velocity_at(motion.reference_times, motion.reference, self._at)
+            body = linear_at(motion.reference_times, motion.reference, self._at)
             if motion.in_earth:
                 body = np.einsum("nji,nj->ni", attitude_at(motion.imu, self._at, GAP_S)[0], body)
             if self._position.any():

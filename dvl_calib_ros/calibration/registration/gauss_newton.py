@@ -55,7 +55,6 @@ MAX_NOISE_SHARE = 0.95
 # Time blocks that σ is estimated from, and the threshold for correlated noise instead of `LASTING_Z`: high, so that the
 # residual of a clock change does not count as noise.
 BLOCKS, CLOCK_LASTING_Z = 48, 2.5
-_Compared = tuple[Index, tuple[Array, ...]]
 
 
 class Claimed(NamedTuple):
@@ -144,17 +143,46 @@ class AxisFactors(NamedTuple):
     level: float
 
 
-class _Rows(NamedTuple):
-    """Linearised rows: residual (J, A) m/s, jacobian (J, A, 9), reference indices `at` (J,), RMS speed (m/s).
+class _Compared(NamedTuple):
+    """Streams at the times of the J compared references, for delays ρ and δ.
 
-    of_noise (J,): expected squared δ column by DVL noise alone.
+    at: (J,) their indices. body: (J, 3) m/s, B. rates: (J, 3) rad/s, ω. velocity: (J, 3) m/s, v, DVL frame, with its
+    slope (J, 3) m/s² and the slope's noise gain (J,). rotation_enu_from_body: (J, 3, 3), zero if not needed.
+    """
+
+    at: Index
+    body: Array
+    rates: Array
+    velocity: Array
+    slope: Array
+    slope_noise_gain: Array
+    rotation_enu_from_body: Array
+
+
+class _Rows(NamedTuple):
+    """Residuals linearised about a state, along the A measured axes.
+
+    residual: (J, A) m/s. jacobian: (J, A, 9) by the states. at: (J,) indices of the references. delay_noise: (J,)
+    (m/s²)², expected squares of the δ column by DVL noise alone. speed: RMS, m/s.
     """
 
     residual: Array
     jacobian: Array
     at: Index
-    of_noise: Array
+    delay_noise: Array
     speed: float
+
+
+class _Step(NamedTuple):
+    """Gauss-Newton step (9,) of the states and its information (9, 9).
+
+    level: robust residual per axis, m/s. weight: (J,) robust weights.
+    """
+
+    step: Array
+    information: Array
+    level: float
+    weight: Array
 
 
 class MotionFit:
@@ -202,7 +230,6 @@ class MotionFit:
         x = np.zeros(N)
         x[DELTA], x[RHO] = delta, rho
         nominal = rotation
-        solved = None
         if not self.is_turned:
             in_time = (*in_time, REFERENCE)
         previous_level = math.inf
@@ -211,24 +238,31 @@ class MotionFit:
             if rows is None:
                 return None
             solved = self._solved(x, rows, nominal, rotation, in_time)
-            step, _, level, _ = solved
-            if round_number >= FAILED_AFTER and level > max(most, MAX_LEVEL_RATIO * previous_level):
+            if round_number >= FAILED_AFTER and solved.level > max(most, MAX_LEVEL_RATIO * previous_level):
                 return None
-            previous_level = level
-            delay_step = float(np.abs(step[[DELTA, RHO]]).max())
-            step = step * min(1.0, MAX_DELAY_STEP_S / max(delay_step, 1e-9))
+            previous_level = solved.level
+            delay_step = float(np.abs(solved.step[[DELTA, RHO]]).max())
+            step = solved.step * min(1.0, MAX_DELAY_STEP_S / max(delay_step, 1e-9))
             x = x + step
             rotation = rotation_of(step[TURN]) @ rotation
             x[TURN] = 0.0
             if delay_step < CONVERGED_STEP and float(np.abs(step).max()) < CONVERGED_STEP:
                 break
         rows = self._rows(x, rotation, among)
-        if rows is None or solved is None:
+        if rows is None:
             return None
-        _, information, level, weight = self._solved(x, rows, nominal, rotation, in_time)
-        squares, axes = squared(rows.residual), rows.residual.shape[1]
-        claims = cache(partial(_claimed, rows, information, level, weight))
-        return Fitted(x, rotation, level, len(rows.at), rows.speed, squares, axes, rows.at, claims)
+        last = self._solved(x, rows, nominal, rotation, in_time)
+        return Fitted(
+            x,
+            rotation,
+            level=last.level,
+            rows=len(rows.at),
+            speed=rows.speed,
+            squares=squared(rows.residual),
+            axes=rows.residual.shape[1],
+            at=rows.at,
+            claims=cache(partial(_claimed, rows, last)),
+        )
 
     def costs(self, x: Array, rotation: Array, level: float) -> tuple[Index, Array]:
         """Return compared references (J,) at a state, and the robust chi-square (J,) of each (`Fitted.cost`)."""
@@ -253,9 +287,9 @@ class MotionFit:
             return AxisFactors(np.ones(3), np.full(3, np.inf), fitted.level)
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_WEIGHT_Z**2 * axes * fitted.level**2))
-        axis_columns = self._axes_of_dvl(fitted, rows, rotation)
         nuisance = [*range(N)[TURN], *range(N)[ARM], DELTA]
-        design = np.concatenate([axis_columns, rows.jacobian[:, :, nuisance]], axis=2).reshape(-1, 3 + len(nuisance))
+        columns = np.concatenate([self._axis_columns(fitted), rows.jacobian[:, :, nuisance]], axis=2)
+        design = columns.reshape(-1, 3 + len(nuisance))
         weights = np.repeat(weight, axes) / fitted.level**2
         from_prior = fitted.x.copy()
         from_prior[TURN], from_prior[DELTA] = turn_between(nominal, rotation), 0.0
@@ -270,31 +304,33 @@ class MotionFit:
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
         return AxisFactors(1.0 + errors[:3], std, fitted.level * math.sqrt(share))
 
-    def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
-        """Return the derivative (J, A, 3) m/s of the residuals with respect to the axis factors."""
-        streams = self._interpolated(float(fitted.x[RHO]), float(fitted.x[DELTA]))
-        assert streams is not None
-        _, (_, _, velocity, _, attitude, _) = streams
-        columns = -(1.0 + fitted.x[SCALE]) * velocity[:, None, :] * rotation
+    def _axis_columns(self, fitted: Fitted) -> Array:
+        """Return the derivative (J, A, 3) m/s of the residuals by the factors of the DVL's axes, see `AxisFactors`.
+
+        The residuals are in the body if all axes are measured, else in the frame of the reference.
+        """
+        compared = self._interpolated(float(fitted.x[RHO]), float(fitted.x[DELTA]))
+        assert compared is not None
+        # the velocity along each axis of the DVL, in the direction of that axis in the body
+        in_body = -(1.0 + fitted.x[SCALE]) * compared.velocity[:, None, :] * fitted.rotation_body_from_dvl
         measured = np.array(self._motion.measured)
         if measured.all():
-            return np.asarray(columns)
-        return np.asarray((attitude @ columns if self._motion.in_earth else columns)[:, measured])
+            return np.asarray(in_body)
+        columns = compared.rotation_enu_from_body @ in_body if self._motion.in_earth else in_body
+        return np.asarray(columns[:, measured])
 
     def _interpolated(self, rho: float, delta: float, among: Fitted | None = None) -> _Compared | None:
-        """Return the compared references (J,) and their streams at delays ρ and δ, or None for too few.
-
-        Streams: B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), slope noise gain (J,).
-        """
+        """Return the streams at delays ρ and δ (s), or None for too few references. among: see `__call__`."""
         m = self._motion
         body_at = self.times - rho
         if m.in_earth and not m.has_attitude:
             return None
-        velocity, slope, gain, known = self._curves.velocity(self.times + delta)
-        needed = m.in_earth or not all(m.measured)
-        rotation, oriented = attitude_at(m.imu, body_at, GAP_S) if needed else (np.zeros((len(body_at), 3, 3)), known)
-        if m.in_earth:
-            known = known & oriented
+        dvl = self._curves.velocity(self.times + delta)
+        known = dvl.found
+        rotation: Array = np.zeros((len(body_at), 3, 3))
+        if m.in_earth or not all(m.measured):
+            rotation, oriented = attitude_at(m.imu, body_at, GAP_S)
+            known = known & oriented if m.in_earth else known
         if among is not None:
             known = known & self._shared(among, rho, delta)
         if np.count_nonzero(known) < FEWEST_SAMPLES:
@@ -302,10 +338,11 @@ class MotionFit:
         rows = np.flatnonzero(known)
         reference_velocity, rotation = self._velocity[rows], rotation[rows]
         body = np.einsum("nji,nj->ni", rotation, reference_velocity) if m.in_earth else reference_velocity
-        return rows, (body, self._curves.rates(body_at[rows]), velocity[rows], slope[rows], rotation, gain[rows])
+        rates = self._curves.rates(body_at[rows])
+        return _Compared(rows, body, rates, dvl.value[rows], dvl.slope[rows], dvl.slope_gain[rows], rotation)
 
     def _shared(self, other: Fitted, rho: float, delta: float) -> Mask:
-        """Return a mask (J,) of references whose DVL samples and attitudes another fit compares, too."""
+        """Return which of the used references (J,) share DVL samples and attitudes with another fit."""
         other_times, shared = self.times[other.at], np.zeros(len(self.times), dtype=bool)
         shared[other.at] = True
         for delay, other_delay in ((delta, float(other.x[DELTA])), (-rho, -float(other.x[RHO]))):
@@ -315,43 +352,40 @@ class MotionFit:
 
     def _best_rotation(self, rho: float, delta: float) -> Array | None:
         """Return the least-squares rotation C (3, 3) at delays ρ and δ (s), without lever arm."""
-        streams = self._interpolated(rho, delta)
-        if streams is None:
+        compared = self._interpolated(rho, delta)
+        if compared is None:
             return None
-        _, (body, _, velocity, *_) = streams
-        square = float((velocity**2).sum())
-        return nearest_rotation(body.T @ velocity + 1e-3 * square * np.eye(3))
+        square = float((compared.velocity**2).sum())
+        return nearest_rotation(compared.body.T @ compared.velocity + 1e-3 * square * np.eye(3))
 
     def _rows(self, x: Array, rotation: Array, among: Fitted | None) -> _Rows | None:
         """Linearise the residuals about a state, in the measured axes; None if too few overlap."""
-        streams = self._interpolated(float(x[RHO]), float(x[DELTA]), among)
-        if streams is None:
+        compared = self._interpolated(float(x[RHO]), float(x[DELTA]), among)
+        if compared is None:
             return None
-        at, (body, rates, velocity, slope, attitude, gain) = streams
-        dvl_in_body = (1.0 + x[SCALE]) * velocity @ rotation.T
+        body, rates, rotation_enu_from_body = compared.body, compared.rates, compared.rotation_enu_from_body
+        dvl_in_body = (1.0 + x[SCALE]) * compared.velocity @ rotation.T
         residual = body + cross(rates, self._lever_arm + x[ARM]) - dvl_in_body
-        jacobian = np.zeros((len(at), 3, N))
+        jacobian = np.zeros((len(compared.at), 3, N))
         jacobian[:, :, TURN] = skew(dvl_in_body)
-        jacobian[:, :, SCALE] = -velocity @ rotation.T
+        jacobian[:, :, SCALE] = -compared.velocity @ rotation.T
         jacobian[:, :, ARM] = skew(rates)
-        jacobian[:, :, DELTA] = -(1.0 + x[SCALE]) * slope @ rotation.T
+        jacobian[:, :, DELTA] = -(1.0 + x[SCALE]) * compared.slope @ rotation.T
         jacobian[:, :, RHO] = cross(rates, body)
         measured = np.array(self._motion.measured)
         if not measured.all():
             if self._motion.in_earth:
-                residual = np.einsum("nij,nj->ni", attitude, residual)
-                jacobian = attitude @ jacobian
+                residual = np.einsum("nij,nj->ni", rotation_enu_from_body, residual)
+                jacobian = rotation_enu_from_body @ jacobian
             residual, jacobian = residual[:, measured], jacobian[:, measured]
+        delay_noise = compared.slope_noise_gain * self.dvl_noise * residual.shape[1]
         speed = float(np.sqrt(squared(body).mean()))
-        return _Rows(residual, jacobian, at, gain * self.dvl_noise * residual.shape[1], speed)
+        return _Rows(residual, jacobian, compared.at, delay_noise, speed)
 
-    def _solved(
-        self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]
-    ) -> tuple[Array, Array, float, Array]:
+    def _solved(self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]) -> _Step:
         """Solve one Gauss-Newton step with priors, robust weights and the constraints of synchronised clocks.
 
-        Returns step (9,), information (9, 9), noise level (m/s) and robust weight of each row (J,). in_time: rows of
-        synchronised clocks, see `__call__`.
+        nominal, rotation: (3, 3) rotation_body_from_dvl of the prior and of the state. in_time: see `__call__`.
         """
         axes = rows.residual.shape[1]
         squares = squared(rows.residual)
@@ -364,7 +398,7 @@ class MotionFit:
         information = weighted @ design + np.diag(prior)
         # DVL noise in the slope counts as information on δ: subtract it, but less than the marginal information on δ
         marginal = 1.0 / float(np.linalg.inv(information)[DELTA, DELTA])
-        information[DELTA, DELTA] -= min(float(weight @ rows.of_noise) / variance, MAX_NOISE_SHARE * marginal)
+        information[DELTA, DELTA] -= min(float(weight @ rows.delay_noise) / variance, MAX_NOISE_SHARE * marginal)
         from_prior = x.copy()
         from_prior[TURN] = turn_between(nominal, rotation)
         from_prior[[DELTA, RHO]] = 0.0
@@ -372,16 +406,16 @@ class MotionFit:
         for constraint in in_time:
             information += HELD_STD_S**-2.0 * np.outer(constraint, constraint)
             gradient -= HELD_STD_S**-2.0 * constraint * float(constraint @ x)
-        return np.linalg.solve(information, gradient), information, float(np.sqrt(variance)), weight
+        return _Step(np.linalg.solve(information, gradient), information, float(np.sqrt(variance)), weight)
 
 
-def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Claimed:
+def _claimed(rows: _Rows, solved: _Step) -> Claimed:
     """Return covariance and σ factors of a solution, inflated for residuals that are correlated in time."""
-    p = np.linalg.inv(information)
+    p = np.linalg.inv(solved.information)
     blocks = TimeBlocks()
     for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):
         h = rows.jacobian[part].reshape(-1, N)
-        w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
+        w = np.repeat(solved.weight[part], rows.residual.shape[1])[:, None] / solved.level**2
         blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
     factor = blocks.inflation(0, np.zeros(N), p, CLOCK_LASTING_Z, None)
     inflation = max(float(factor[[DELTA, RHO]].max()), _correlation_inflation(rows.residual))

@@ -21,6 +21,7 @@ from ..streams.interpolation import (
     REACH_INTERVALS,
     DvlColumns,
     ImuColumns,
+    LocalFit,
     TurnRates,
     angular_velocity_at,
     binned,
@@ -181,11 +182,12 @@ class Curves:
         made._velocity = self._velocity * np.concatenate([signs, signs, [1.0]])
         return made
 
-    def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
-        """Return velocity (J, 3) m/s, slope (J, 3) m/s², slope noise gain (J,) and validity at times (J,) s."""
+    def velocity(self, at: Array) -> LocalFit:
+        """Return the DVL's velocity (J, 3) m/s and its slope (J, 3) m/s² at times (J,) s."""
         before, share, inside = self._places(at, self._start, len(self._grid))
         columns = _between(self._velocity, before, share)
-        return columns[:, :3], columns[:, 3:6], columns[:, 6], inside & self._found[before] & self._found[before + 1]
+        found = inside & self._found[before] & self._found[before + 1]
+        return LocalFit(columns[:, :3], columns[:, 3:6], columns[:, 6], found)
 
     def rates(self, at: Array) -> Array:
         """Return angular rates (J, 3) rad/s at times (J,) s, zero where unknown."""
@@ -193,6 +195,7 @@ class Curves:
         return np.where(inside[:, None], _between(self._turns, before, share), 0.0)
 
     def _places(self, at: Array, start: float, n: int) -> tuple[Index, Array, Mask]:
+        """Return the grid point before each time (J,) s, the share of a step beyond it (J, 1), and whether inside."""
         place = (at - start) / self._step
         before = np.clip(place, 0, n - 2).astype(np.intp)
         return before, (place - before)[:, None], (place >= 0.0) & (place <= n - 1)

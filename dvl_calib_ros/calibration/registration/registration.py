@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -197,94 +197,127 @@ def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_
     rotation_body_from_dvl: (3, 3) nominal mounting; None to estimate it.
     lever_arm: (3,) m configured DVL position from the reference point, body frame.
     """
-    return _registered(motion, rotation_body_from_dvl, lever_arm, None)
+    return _registered(motion, rotation_body_from_dvl, lever_arm, are_clocks_steady=False)
 
 
 def _registered(
-    motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, change: ClockChange | None
+    motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, *, are_clocks_steady: bool
 ) -> Registration | None:
-    """Register a motion. change: clock change that is already corrected; None to search for one."""
+    """Register a motion, see `register`. are_clocks_steady: search for no clock change."""
     curves = Curves(motion)
-    fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (FULL_ROWS, QUICK_ROWS))
-    best = _fit_at_likeliest_delays(motion, quick, rotation_body_from_dvl)
-    if best is None:
+    full, quick = (MotionFit(motion, lever_arm, curves, most) for most in (FULL_ROWS, QUICK_ROWS))
+    likeliest = _fit_at_likeliest_delays(motion, quick, rotation_body_from_dvl)
+    if likeliest is None:
         return None
-    if change is None and best.inflation > STEADY_INFLATION:
+    if not are_clocks_steady and likeliest.inflation > STEADY_INFLATION:
         change = _change(motion, curves, lever_arm, rotation_body_from_dvl)
         if change is not None:
-            found = _registered(change.corrected(motion), rotation_body_from_dvl, lever_arm, change)
+            changed = _with_change_corrected(motion, full, change, rotation_body_from_dvl, lever_arm)
             # several delays fit each stretch in waves; a real clock change lowers the total residual
-            if found is not None and found.spread < best.level:
-                state = np.zeros(N)
-                state[SCALE], state[ARM] = found.scale, found.lever_arm - lever_arm
-                state[DELTA], state[RHO] = found.dvl.delay_s - found.reference.delay_s, found.reference.delay_s
-                change = change.timed(motion, fit, state, found.rotation_body_from_dvl, found.spread)
-                return replace(found, unsteady=change)
-    synchronised = _fit_in_sync(quick, best, rotation_body_from_dvl)
-    if synchronised[1] < IN_SYNC_CHI2:  # the full fit would add no evidence
-        explained = _fewest_delayed_clocks(quick, best, synchronised, rotation_body_from_dvl, lever_arm)
+            if changed is not None and changed.spread < likeliest.level:
+                return changed
+    return _with_steady_clocks(full, quick, likeliest, rotation_body_from_dvl, lever_arm)
+
+
+def _with_change_corrected(
+    motion: MotionStreams, full: MotionFit, change: ClockChange, rotation: Array | None, lever_arm: Array
+) -> Registration | None:
+    """Register a motion with a clock change corrected, and refine the time of a step. full: fit of the motion."""
+    found = _registered(change.corrected(motion), rotation, lever_arm, are_clocks_steady=True)
+    if found is None:
+        return None
+    before_step = np.zeros(N)
+    before_step[SCALE], before_step[ARM] = found.scale, found.lever_arm - lever_arm
+    before_step[DELTA], before_step[RHO] = found.dvl.delay_s - found.reference.delay_s, found.reference.delay_s
+    timed = change.timed(motion, full, before_step, found.rotation_body_from_dvl, found.spread)
+    return replace(found, unsteady=timed)
+
+
+def _with_steady_clocks(
+    full: MotionFit, quick: MotionFit, likeliest: Fitted, rotation: Array | None, lever_arm: Array
+) -> Registration | None:
+    """Register by the quick fit if it leaves nothing open, else by the full fit, which has more references.
+
+    likeliest: quick fit at the likeliest delays.
+    """
+    in_sync = _fit_in_sync(quick, likeliest, rotation)
+    start = likeliest
+    if in_sync.chi2 < IN_SYNC_CHI2:
+        explained = _fewest_delayed_clocks(quick, likeliest, in_sync, rotation, lever_arm)
         if not explained.left_open.any():
             return explained
-        # more references determine the reference clock better
-        free = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
-        if free is None or not _is_possible(free):
+        free = _refitted(full, likeliest, rotation)
+        if free is None:
             return explained
-        if _fit_in_sync(fit, free, rotation_body_from_dvl)[1] < IN_SYNC_CHI2:
-            return replace(explained, **_reference_clock(fit, free, 0.0, rotation_body_from_dvl))
-        best = free
-    best = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
-    if best is None or not _is_possible(best):
+        if _fit_in_sync(full, free, rotation).chi2 < IN_SYNC_CHI2:  # only σ of the reference clock changes
+            return replace(explained, **_reference_clock(full, free, 0.0, rotation))
+        start = free
+    free = _refitted(full, start, rotation)
+    if free is None:
         return None
-    synchronised = _fit_in_sync(fit, best, rotation_body_from_dvl)
-    return _fewest_delayed_clocks(fit, best, synchronised, rotation_body_from_dvl, lever_arm)
+    return _fewest_delayed_clocks(full, free, _fit_in_sync(full, free, rotation), rotation, lever_arm)
+
+
+def _refitted(fit: MotionFit, start: Fitted, rotation: Array | None) -> Fitted | None:
+    """Fit from the delays of another fit. Return None without a possible fit."""
+    found = fit(float(start.x[RHO]), float(start.x[DELTA]), rotation)
+    return found if found is not None and _is_possible(found) else None
 
 
 def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> Fitted | None:
-    """Return the fit at the likeliest delays of a motion."""
+    """Return the fit with the smallest delays among those that fit about as well as the best one.
+
+    Repeated legs and periodic waves agree at several delays, of which the smallest are the likeliest.
+    """
     candidates = candidate_delays(motion, rotation)
     max_misfit = MISFIT_LIMIT[0] * candidates[0].misfit + MISFIT_LIMIT[1] if candidates else 0.0
     delays = [(each.reference, each.dvl - each.reference) for each in candidates if each.misfit <= max_misfit]
-    fits = [quick(*rho_and_delta, rotation) for rho_and_delta in {*delays, (0.0, 0.0)}]
-    fitted = [each for each in fits if each is not None and _is_possible(each)]
-    if not fitted:
+    fits = [quick(rho, delta, rotation) for rho, delta in {*delays, (0.0, 0.0)}]
+    possible = [each for each in fits if each is not None and _is_possible(each)]
+    if not possible:
         return None
-    closest = min(fitted, key=lambda each: each.level)
-    # repeated legs agree at several delays
-    as_good = [each for each in fitted if _is_as_good(motion, quick, each, closest, rotation)]
+    closest = min(possible, key=lambda each: each.level)
+    as_good = [each for each in possible if _is_as_good(motion, quick, each, closest, rotation)]
     return min(as_good, key=lambda each: abs(each.x[RHO]) + abs(each.dvl_delay_s))
 
 
 def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
-    """Return the clock drift or step between the stretches of a motion, or None."""
+    """Return the clock drift or step between stretches of a motion, or None. curves: of the whole motion."""
     times = motion.reference_times
     n_stretches = min(int((times[-1] - times[0]) / STRETCH_S), MAX_STRETCHES)
-    found = []
-    for rows in np.array_split(np.arange(len(times)), max(n_stretches, 1)) if n_stretches > 1 else ():
+    if n_stretches < 2:
+        return None
+    mean_times, fits = [], []
+    for rows in np.array_split(np.arange(len(times)), n_stretches):
         stretch = motion.part(rows, FARTHEST_S)
         best = _fit_at_likeliest_delays(stretch, MotionFit(stretch, lever_arm, curves, ROWS_OF_STRETCH), rotation)
         if best is not None:
-            found.append((float(times[rows].mean()), best))
+            mean_times.append(float(times[rows].mean()))
+            fits.append(best)
     is_turned = motion.in_earth and motion.has_attitude
-    return unsteady(np.array([mean for mean, _ in found]), [best for _, best in found], is_turned, stamps(motion))
+    return unsteady(np.array(mean_times), fits, is_turned, stamps(motion))
 
 
 def _fewest_delayed_clocks(
-    fit: MotionFit, free: Fitted, synchronised: tuple[Fitted | None, float], rotation: Array | None, lever_arm: Array
+    fit: MotionFit, free: Fitted, in_sync: _HeldFit, rotation: Array | None, lever_arm: Array
 ) -> Registration:
-    """Explain a fit with free delays by the fewest delayed clocks: none (synchronised), one of three, or two."""
-    delta = float(free.x[DELTA])
+    """Explain a fit with free delays by the fewest delayed clocks: none, one of three, or two.
+
+    in_sync: fit without a delayed clock.
+    """
+    rho, delta = float(free.x[RHO]), float(free.x[DELTA])
     dvl_penalty, ref_penalty = (EARLY_PENALTY, 0.0) if delta < 0.0 else (0.0, EARLY_PENALTY)
-    tried = {_Delayed.NONE: synchronised}
-    if tried[_Delayed.NONE][1] >= IN_SYNC_CHI2:
+    tried = {_Delayed.NONE: in_sync}
+    if in_sync.chi2 >= IN_SYNC_CHI2:
         tried |= {
             _Delayed.DVL: _fit_in_sync(fit, free, rotation, 0.0, delta, (REFERENCE,), GAIN_PER_CLOCK + dvl_penalty),
             _Delayed.REFERENCE: _fit_in_sync(fit, free, rotation, -delta, delta, (DVL,), GAIN_PER_CLOCK + ref_penalty),
-            _Delayed.IMU: _fit_in_sync(fit, free, rotation, float(free.x[RHO]), 0.0, (BOTH_ALIKE,), GAIN_PER_CLOCK),
+            _Delayed.IMU: _fit_in_sync(fit, free, rotation, rho, 0.0, (BOTH_ALIKE,), GAIN_PER_CLOCK),
         }
-    likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
-    # BOTH includes every other explanation, so it is no alternative
-    next_worse = min((worse for each, (_, worse) in tried.items() if each is not likeliest), default=math.inf) - cost
-    if best is None or cost > 2.0 * GAIN_PER_CLOCK:
+    likeliest = min(tried, key=lambda clock: tried[clock].chi2)
+    best, chi2 = tried.pop(likeliest)
+    next_worse = min((held.chi2 for held in tried.values()), default=math.inf) - chi2
+    if best is None or chi2 > 2.0 * GAIN_PER_CLOCK:  # two clocks, which include every other explanation
         likeliest, best, next_worse = _Delayed.BOTH, free, math.inf
     is_identified = next_worse > RULED_OUT
     x, p = best.x, best.p
@@ -314,18 +347,22 @@ def _fewest_delayed_clocks(
 
 
 def _reference_clock(fit: MotionFit, free: Fitted, delay_s: float, rotation: Array | None) -> dict[str, Any]:
-    """Return open_std_s and open_by of a fit with free clocks. delay_s: adopted reference delay, s."""
+    """Return `Registration.open_std_s` and `open_by` from a fit with free clocks.
+
+    delay_s: adopted reference delay, s; 0 if the reference is taken as synchronised.
+    """
     if not fit.is_turned:
         return {"open_std_s": 0.0, "open_by": np.zeros(7)}
-    # by: sensitivity of all states to the reference delay
-    std, by, offset = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
+    std, by_delay, offset = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
     if offset > OPEN_Z * std and delay_s == 0.0:
         std = offset
     if offset > OPEN_Z * PRIOR_DELAY_STD_S and delay_s == 0.0:
         # the free delay is so large that its sensitivities do not hold at zero delay
+        std = max(std, offset)
         prior_fit = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / PRIOR_DELAY_STD_S),))
-        std, by = max(std, offset), by if prior_fit is None else prior_fit.by(RHO)
-    return {"open_std_s": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[DELTA]]])}
+        if prior_fit is not None:
+            by_delay = prior_fit.by(RHO)
+    return {"open_std_s": std, "open_by": np.concatenate([by_delay[TURN], by_delay[ARM], [1.0 + by_delay[DELTA]]])}
 
 
 def _with_prior(std: float) -> float:
@@ -334,9 +371,16 @@ def _with_prior(std: float) -> float:
 
 
 class _Delayed(Enum):
-    """Delayed clock."""
+    """Delayed clock; BOTH: DVL and reference."""
 
     NONE, DVL, REFERENCE, IMU, BOTH = range(5)
+
+
+class _HeldFit(NamedTuple):
+    """Fit with some clocks synchronised, None if impossible. chi2: growth over the free fit, plus penalties."""
+
+    fit: Fitted | None
+    chi2: float
 
 
 def _fit_in_sync(
@@ -346,19 +390,19 @@ def _fit_in_sync(
     rho: float = 0.0,
     delta: float = 0.0,
     held_clocks: tuple[Array, ...] = (DVL, REFERENCE),
-    costs: float = 0.0,
-) -> tuple[Fitted | None, float]:
-    """Fit with some or all clocks synchronised. Return the fit and its chi-square growth plus `costs`.
+    penalty: float = 0.0,
+) -> _HeldFit:
+    """Fit with some or all clocks synchronised, and compare with the fit `free`.
 
-    held_clocks: rows that select the synchronised clocks. Without a possible fit: None and infinity.
+    rho, delta: initial delays, s. held_clocks: rows that select the synchronised clocks. penalty: chi-square added.
     """
     held = fit(rho, delta, rotation, held_clocks)
     if held is None or not _is_possible(held):
-        return None, math.inf
+        return _HeldFit(None, math.inf)
     # the number of compared samples depends on the delays
     grown = held.cost(free.level, held.at) * free.rows / held.rows - free.cost(free.level, free.at)
     grown /= free.inflation**2
-    return held, grown + costs if math.isfinite(grown) else math.inf
+    return _HeldFit(held, grown + penalty if math.isfinite(grown) else math.inf)
 
 
 def _is_off(fitted: Fitted, index: int) -> bool:
@@ -387,26 +431,28 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, other: Fitted, closest: F
     A delay may lower the residual by moving a bad DVL stretch out of the overlap. Candidates with other DVL delays also
     sample other DVL noise; in periodic waves this alone makes a difference.
     """
-    is_read_elsewhere = abs(float(other.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
-    chance_gain = LOG_GAIN + (_chance_gain_std(motion, other, fit.dvl_noise) if is_read_elsewhere else 0.0)
+    has_other_dvl_noise = abs(float(other.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
+    chance_gain = LOG_GAIN + (_chance_gain_std(motion, other, fit.dvl_noise) if has_other_dvl_noise else 0.0)
     if _gain(motion, other, closest) < chance_gain:
         return True
     if closest.rows > MIN_ROW_SHARE * other.rows:
         return False
-    refitted = fit(float(other.x[RHO]), float(other.x[DELTA]), rotation, (), closest)
-    if refitted is None:
+    on_same_rows = fit(float(other.x[RHO]), float(other.x[DELTA]), rotation, (), closest)
+    if on_same_rows is None:
         return False
-    grown = refitted.cost(closest.level, refitted.at) - closest.cost(closest.level, refitted.at)
-    return 0.5 * grown * min(1.0, _independent_rows(motion, refitted) / refitted.rows) < chance_gain
+    shared = on_same_rows.at
+    grown = on_same_rows.cost(closest.level, shared) - closest.cost(closest.level, shared)
+    return 0.5 * grown * min(1.0, _independent_rows(motion, on_same_rows) / on_same_rows.rows) < chance_gain
 
 
 def _chance_gain_std(motion: MotionStreams, fitted: Fitted, dvl_noise: float) -> float:
     """Return σ of the log-evidence difference of two candidates that sample different DVL noise."""
-    share = min(dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of the residual variance
+    dvl_share = min(dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of the residual variance
     # variance of (g + a)² - (g + b)² in units of the residual variance: g reference noise, a and b DVL noise
-    each = 8.0 * share * (1.0 - share) + 4.0 * share**2
+    variance_per_sample = 8.0 * dvl_share * (1.0 - dvl_share) + 4.0 * dvl_share**2
     samples = fitted.rows * fitted.axes
-    return 0.5 * math.sqrt(each * samples) * min(1.0, _independent_rows(motion, fitted) / fitted.rows)
+    independent_share = min(1.0, _independent_rows(motion, fitted) / fitted.rows)
+    return 0.5 * math.sqrt(variance_per_sample * samples) * independent_share
 
 
 def _gain(motion: MotionStreams, one: Fitted, other: Fitted) -> float:

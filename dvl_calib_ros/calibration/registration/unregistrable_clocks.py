@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from ..streams.interpolation import attitude_at, shortened
+from ..streams.interpolation import attitude_at, linear_at, shortened
 from .delay_search import FARTHEST_S, HOLE_S, MIN_OVERLAP, STEP_S
 from .motion_streams import MotionStreams
 
@@ -57,28 +57,35 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
     dvl_times, velocity = motion.dvl
     body = velocity @ rotation_dvl_from_body
     reference_times, reference = motion.reference_times, motion.reference
-    known = (covered(reference_times, _steps(reference_times)), covered(dvl_times, _steps(dvl_times)))
-    speeds = _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0]
-    delay_s, is_far = lag(*speeds, *(mask.astype(float) for mask in known))
-    if is_far:
-        return UnregistrableClocks("the DVL's", "the reference's", delay_s)
+    of_speed = lag(
+        _speed(dvl_times, body),
+        dvl_times[0],
+        _speed(reference_times, reference),
+        reference_times[0],
+        covered(reference_times, _steps(reference_times)).astype(float),
+        covered(dvl_times, _steps(dvl_times)).astype(float),
+    )
+    if of_speed.is_far:
+        return UnregistrableClocks("the DVL's", "the reference's", of_speed.delay_s)
     if not motion.in_earth or not motion.has_attitude:
         return None
-    synchronised_times = dvl_times - delay_s
+    synchronised_times = dvl_times - of_speed.delay_s
     start, end = max(synchronised_times[0], reference_times[0]), min(synchronised_times[-1], reference_times[-1])
     shared_grid = np.arange(start, end, STEP_S)
     if not len(shared_grid):
         return None
     # direction over ground relative to the direction in the body: the heading without the IMU
-    heading: Series = (velocity_at(reference_times, reference, shared_grid)[:, :2] @ [1.0, 1j]) * np.conj(
-        velocity_at(dvl_times, body, shared_grid + delay_s)[:, :2] @ [1.0, 1j]
+    heading: Series = (linear_at(reference_times, reference, shared_grid)[:, :2] @ [1.0, 1j]) * np.conj(
+        linear_at(dvl_times, body, shared_grid + of_speed.delay_s)[:, :2] @ [1.0, 1j]
     )
     imu_grid = _steps(motion.imu.times)
     rotation, _ = attitude_at(motion.imu, imu_grid, HOLE_S)
     imu_heading: Series = rotation[:, :2, 0] @ [1.0, 1j]
     moving = ((np.abs(heading) > MOVING_MPS**2) & covered(reference_times, shared_grid)).astype(float)
-    delay_s, is_far = lag(_unit(imu_heading), motion.imu.times[0], _unit(heading), shared_grid[0], moving)
-    return UnregistrableClocks("the IMU's", "those of DVL and reference", delay_s) if is_far else None
+    of_heading = lag(_unit(imu_heading), motion.imu.times[0], _unit(heading), shared_grid[0], moving)
+    if of_heading.is_far:
+        return UnregistrableClocks("the IMU's", "those of DVL and reference", of_heading.delay_s)
+    return None
 
 
 def _without_long_pauses(motion: MotionStreams) -> MotionStreams:
@@ -118,17 +125,19 @@ def covered(times: Array, at: Array) -> NDArray[np.bool_]:
     return np.asarray(is_near & (at >= times[0]) & (at <= times[-1]))
 
 
-def velocity_at(times: Array, values: Array, at: Array) -> Array:
-    """Interpolate a stream (N, 3) linearly at times (M,). Return (M, 3)."""
-    return np.column_stack([np.interp(at, times, column) for column in values.T])
-
-
 def _speed(times: Array, velocity: Array) -> Series:
     """Return the median-filtered horizontal speed (N,) m/s, every STEP_S from the first sample on."""
-    values = velocity_at(times, velocity, _steps(times))
+    values = linear_at(times, velocity, _steps(times))
     around = np.pad(np.hypot(values[:, 0], values[:, 1]), SPIKE_STEPS // 2)
     windows = np.lib.stride_tricks.sliding_window_view(around, SPIKE_STEPS)
     return np.asarray(median(windows.T), dtype=complex)
+
+
+class Lag(NamedTuple):
+    """Delay (s) of one series relative to another. is_far: it surely exceeds FARTHEST_S."""
+
+    delay_s: float
+    is_far: bool
 
 
 def lag(
@@ -138,8 +147,8 @@ def lag(
     other_start: float,
     weight: Array | None = None,
     own: Array | None = None,
-) -> tuple[float, bool]:
-    """Return the delay (s) of a series relative to another, and whether it surely exceeds FARTHEST_S.
+) -> Lag:
+    """Return the delay of a series relative to another.
 
     The delay minimises the mean squared difference; it must be clearly better than none, a far one than all near ones.
 
@@ -152,22 +161,7 @@ def lag(
     n, m = len(series), len(other)
     weight = np.ones(m) if weight is None else weight
     own = np.ones(n) if own is None else own
-    size = n + m
-
-    def correlated(a: Series | Array, b: Series | Array) -> Array:
-        """Return Σ Re(a(i + lag) conj(b(i))) for lags -(m - 1) .. n - 1."""
-        sums = np.real(np.fft.ifft(np.fft.fft(a, size) * np.conj(np.fft.fft(b, size))))
-        return np.concatenate([sums[size - (m - 1) :], sums[:n]])
-
-    def means(weight: Array) -> Array:
-        """Return the mean squared difference at each lag, infinite where the overlap is too short."""
-        count = correlated(own, weight)
-        squares = correlated(own * np.abs(series) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
-        squares -= 2.0 * correlated(own * series, weight * other)
-        is_enough = count >= max(MIN_OVERLAP * min(float(n), float(weight.sum())), SHORTEST_OVERLAP_S / STEP_S)
-        return np.where(is_enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
-
-    mean = means(weight)
+    mean = _mean_squares(series, own, other, weight)
     delays = series_start - other_start + STEP_S * np.arange(-(m - 1), n)
     is_near = np.abs(delays) <= FARTHEST_S + STEP_S
     best = int(np.argmin(mean))
@@ -176,15 +170,35 @@ def lag(
         # compare on the same samples: a noisy stretch may be outside the overlap of the far delay
         index = np.arange(m) + best - (m - 1)
         overlap = np.where((index >= 0) & (index < n), weight, 0.0)
-        smallest_near = min(smallest_near, float(means(overlap)[is_near].min(initial=np.inf)))
+        on_overlap = _mean_squares(series, own, other, overlap)
+        smallest_near = min(smallest_near, float(on_overlap[is_near].min(initial=np.inf)))
         # periodic motion may agree at far lags, but it then agrees at near lags, too, to the change within one step
         pair_weight = weight[1:] * weight[:-1]
         step_change = float((pair_weight * np.abs(np.diff(other)) ** 2).sum() / max(pair_weight.sum(), 1.0))
         if mean[best] < MAX_SQUARE_SHARE * smallest_near and smallest_near > step_change:
             # repeated legs agree at several lags: take the smallest
             as_good = np.where(mean <= 1.5 * mean[best], np.abs(delays), np.inf)
-            return float(delays[int(np.argmin(as_good))]), True
+            return Lag(float(delays[int(np.argmin(as_good))]), True)
     best = int(np.argmin(np.where(is_near, mean, np.inf)))
     # a nearly constant speed agrees as well at any lag
     is_better = is_near[best] and mean[best] < MAX_SQUARE_SHARE * mean[int(np.argmin(np.abs(delays)))]
-    return float(delays[best]) if is_better else 0.0, False
+    return Lag(float(delays[best]) if is_better else 0.0, False)
+
+
+def _mean_squares(series: Series, own: Array, other: Series, weight: Array) -> Array:
+    """Return the mean squared difference at lags -(M - 1) .. N - 1 steps, infinite where the overlap is too short.
+
+    series: (N,) with weights `own`. other: (M,) with weights `weight`.
+    """
+    count = _correlated(own, weight)
+    squares = _correlated(own * np.abs(series) ** 2, weight) + _correlated(own, weight * np.abs(other) ** 2)
+    squares -= 2.0 * _correlated(own * series, weight * other)
+    is_enough = count >= max(MIN_OVERLAP * min(float(len(own)), float(weight.sum())), SHORTEST_OVERLAP_S / STEP_S)
+    return np.where(is_enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
+
+
+def _correlated(a: Series | Array, b: Series | Array) -> Array:
+    """Return Σ Re(a(i + lag) conj(b(i))) for lags -(M - 1) .. N - 1, of a (N,) and b (M,)."""
+    n, m = len(a), len(b)
+    sums = np.real(np.fft.ifft(np.fft.fft(a, n + m) * np.conj(np.fft.fft(b, n + m))))
+    return np.concatenate([sums[n + 1 :], sums[:n]])

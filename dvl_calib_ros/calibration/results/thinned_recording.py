@@ -14,7 +14,7 @@ from ..numerics.error_model import correction_matrix
 from ..numerics.frames import Array, cross
 from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask, Stamps
-from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, attitude_at
+from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, attitude_at, linear_at
 
 # Shortest interval of thinned samples, s: five per second suffice for a velocity error.
 KEPT_EVERY_S = 0.19
@@ -142,7 +142,7 @@ class ThinnedRecording(NamedTuple):
         body = np.matmul(body_from_reference, (before + (later - before) * fraction)[..., None])[..., 0]
         rates = np.zeros_like(velocity)
         if len(self.imu.times):
-            rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
+            rates = linear_at(self.imu.times, self.imu.angular_velocity, times)
         arm = np.array(p.lever_arm) + terms.lever_arm
         matrix = correction_matrix(terms.errors[:3], terms.errors[3:], p.rotation_dvl_from_body)
         error = body + (cross(rates, arm) if arm.any() else 0.0) - velocity @ matrix.T

@@ -96,8 +96,7 @@ class Events(NamedTuple):
         order = np.argsort(arrival, kind="stable")
         event_of_sample = np.empty(len(order), dtype=np.intp)
         event_of_sample[order] = np.arange(len(order))
-        first, second = len(arrivals[0]), len(arrivals[0]) + len(arrivals[1])
-        events_of_stream = event_of_sample[:first], event_of_sample[first:second], event_of_sample[second:]
+        events_of_stream = np.split(event_of_sample, np.cumsum([len(each) for each in arrivals[:2]]))
         newest_ns = []
         for events, stamps, newest_before in zip(events_of_stream, stamps_ns, before_ns, strict=True):
             column = np.full(len(order), LONG_AGO_NS if newest_before is None else newest_before, dtype=np.int64)
@@ -108,7 +107,8 @@ class Events(NamedTuple):
         for track_ns in newest_ns[1:]:
             ahead = (track_ns > dvl_ns) & (track_ns <= dvl_ns + max_jump_ns)
             horizon_ns = np.maximum(horizon_ns, np.where(ahead, track_ns, dvl_ns))
-        return Events(arrival[order], *events_of_stream, newest_ns[1], newest_ns[2], horizon_ns)
+        dvl_at, reference_at, imu_at = events_of_stream
+        return Events(arrival[order], dvl_at, reference_at, imu_at, newest_ns[1], newest_ns[2], horizon_ns)
 
 
 def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
@@ -117,28 +117,30 @@ def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
     max_speed, believed = parameters.max_speed, parameters.use_message_covariance
     dvl_screen, reference_screen = (screen_columns(each.covariances, believed) for each in (dvl, reference))
     orientation, rates = unit_quaternions(imu.orientation), valid_rates(imu.angular_velocity)
+    dvl_is_measured = dvl_screen.unmeasured == 0
+    reference_is_measured = reference_screen.unmeasured != ALL_AXES
+    imu_is_known = ~(np.isnan(orientation[:, 0]) & np.isnan(rates[:, 0]))
+    dvl_is_valid = dvl_screen.valid & are_valid_velocities(dvl.values, max_speed)
+    reference_is_valid = reference_screen.valid & are_valid_velocities(reference.values, max_speed)
     return ScreenedStreams(
         streams,
-        (dvl.refused == 0)
-        & dvl_screen.valid
-        & (dvl_screen.unmeasured == 0)
-        & are_valid_velocities(dvl.values, max_speed),
-        (reference.refused == 0)
-        & reference_screen.valid
-        & (reference_screen.unmeasured != ALL_AXES)
-        & are_valid_velocities(reference.values, max_speed),
-        (imu.refused == 0) & ~(np.isnan(orientation[:, 0]) & np.isnan(rates[:, 0])),
-        dvl_screen.covariance,
-        np.concatenate([reference.values, reference_screen.covariance.reshape(-1, 9)], axis=1),
-        reference_screen.unmeasured,
-        np.concatenate([orientation, rates], axis=1),
+        dvl=(dvl.refused == 0) & dvl_is_valid & dvl_is_measured,
+        reference=(reference.refused == 0) & reference_is_valid & reference_is_measured,
+        imu=(imu.refused == 0) & imu_is_known,
+        dvl_covariance=dvl_screen.covariance,
+        reference_values=np.concatenate([reference.values, reference_screen.covariance.reshape(-1, 9)], axis=1),
+        reference_unmeasured=reference_screen.unmeasured,
+        imu_values=np.concatenate([orientation, rates], axis=1),
     )
 
 
 def ordered(
     screened: ScreenedStreams, orders: Mapping[Stream, Sequencer[Any]], clocks: Clocks, first_ns: int | None
 ) -> OrderedStreams | None:
-    """Return the admitted rows, or None if a stream has a jump. first_ns: first DVL stamp, if known."""
+    """Return the admitted rows of valid samples with corrected stamps, or None if a stream has a jump.
+
+    first_ns: first DVL stamp of the run, from which its clock drifts; None if it is in this block.
+    """
     streams = screened.streams
     dvl_ns = streams.dvl.stamps_ns[screened.dvl]
     if len(dvl_ns):
@@ -166,8 +168,9 @@ def decisions(
     A late reference may still arrive while its row waits for attitude.
     """
     n_events = len(events.horizon_ns)
-    waiting = min(partners.n_oriented, partners.n_paired)
+    waiting = min(partners.n_oriented, partners.n_paired)  # number of the first waiting row
     stamps_ns = np.concatenate([rows.stamps_ns[waiting - rows.base : rows.size], chunk.dvl_ns])
+    # a new row can be decided from its own arrival on
     since = np.concatenate([np.zeros(len(stamps_ns) - len(chunk.dvl_ns), dtype=np.intp), events.dvl_at])
     to_orient, to_pair = partners.n_oriented - waiting, partners.n_paired - waiting
     oriented_at = imu.decided_in(stamps_ns, since, chunk.imu_ns, events.imu_at, events.imu_ns, events.horizon_ns)

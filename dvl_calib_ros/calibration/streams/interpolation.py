@@ -77,6 +77,11 @@ class TurnRates(NamedTuple):
         return TurnRates(*binned(imu.times[known], imu.angular_velocity[known]))
 
 
+def linear_at(times: Array, values: Array, at: Array) -> Array:
+    """Interpolate values (N, k) at times (N,) linearly at other times (M,); at both ends they are constant."""
+    return np.column_stack([np.interp(at, times, column) for column in values.T])
+
+
 def shortened(pauses: Array, max_sum: float) -> Array:
     """Clip the longest pauses (N,), s, to a common length so that their sum is at most `max_sum`, s."""
     if pauses.sum() <= max_sum:
@@ -210,7 +215,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
         no_fit = np.full((len(at), values.shape[1]), np.nan)
         return LocalFit(no_fit, no_fit, no_fit[:, 0], found)
     after = np.searchsorted(times, at)
-    half_width = _within(times, float(np.nanmax(reach)))
+    half_width = _most_within(times, float(np.nanmax(reach)))
     # window along the first axis, so that sums run over whole rows
     index = after + np.arange(-half_width, half_width)[:, None]
     exists = (index >= 0) & (index < len(times))
@@ -220,8 +225,8 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     taper = 1.0 - distance * distance * distance
     weight = np.where(exists & (distance < 1.0), taper * taper * taper, 0.0)
     used = weight > 0.0
-    before, after = used & (u <= 0.0), used & (u >= 0.0)
-    found &= np.minimum(np.add.reduce(before, 0, dtype=np.intp), np.add.reduce(after, 0, dtype=np.intp)) >= ON_EACH_SIDE
+    n_before, n_after = (np.add.reduce(used & side, 0, dtype=np.intp) for side in (u <= 0.0, u >= 0.0))
+    found &= np.minimum(n_before, n_after) >= ON_EACH_SIDE
     weight_u = weight * u
     weight_u2 = weight_u * u
     # normal equations of a + b u + c u², and the first two rows of their inverse by cofactors
@@ -241,7 +246,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     return LocalFit(value, slope, np.einsum("wm,wm->m", slope_weights, slope_weights), found)
 
 
-def _within(times: Array, seconds: float) -> int:
+def _most_within(times: Array, seconds: float) -> int:
     """Return the largest number of consecutive samples within a time, at least one.
 
     times: (N,) s, increasing.

@@ -95,11 +95,10 @@ class LiveAlignment:
         self.reference = ReferenceTrack(p, gnss_ns, latency_ns, retention_ns)
         self.imu = Track(imu_ns, latency_ns, retention_ns)
         self._tracks = {Stream.REFERENCE: self.reference, Stream.IMU: self.imu}
-        self.tally: dict[str, Counter[str]] = {
-            name: Counter() for name in (*(each.value for each in Stream), "pairing")
-        }
+        streams = [stream.value for stream in Stream]
+        self.tally: dict[str, Counter[str]] = {name: Counter() for name in (*streams, "pairing")}
         # counter names of refused messages, by stream
-        self.refusal_counters: dict[str, set[str]] = {stream.value: set() for stream in Stream}
+        self.refusal_counters: dict[str, set[str]] = {name: set() for name in streams}
         # streams that still deliver samples from before a restart of the DVL stamps
         self._before_restart: set[Stream] = set()
         self._n_messages = 0

@@ -7,7 +7,7 @@ import numpy as np
 from ..models import POSITIONS
 from ..models.parameters import ParameterError, Parameters
 from ..numerics.frames import Array, cross
-from .interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
+from .interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at, linear_at
 
 # Noise from which velocities derived from positions are useless, m/s.
 NOISY_MPS = 0.3
@@ -54,17 +54,16 @@ def _deconvolved(times: Array, velocity: Array, window_s: float) -> Array:
     if len(times) < 2:
         return velocity
     known = np.ones(len(times), dtype=bool)
-    shifted_times = []
-    for shifted in (times - window_s, times + window_s):
-        after = np.clip(np.searchsorted(times, shifted), 1, len(times) - 1)
+    before, after = times - window_s, times + window_s
+    for shifted in (before, after):
+        sample = np.clip(np.searchsorted(times, shifted), 1, len(times) - 1)
         # no correction beyond an end and across an outage
-        known &= (shifted >= times[0]) & (shifted <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
-        shifted_times.append(shifted)
+        known &= (shifted >= times[0]) & (shifted <= times[-1]) & (times[sample] - times[sample - 1] <= 1.5 * window_s)
     corrected, difference = velocity.copy(), velocity
     for factor in SERIES:
-        sides = sum(np.column_stack([np.interp(at, times, axis) for axis in difference.T]) for at in shifted_times)
+        sides = linear_at(times, difference, before) + linear_at(times, difference, after)
         difference = np.where(known[:, None], sides - 2.0 * difference, 0.0)
         corrected += factor * difference
         # the next difference needs this one on both sides
-        known = known & np.all([np.interp(shifted, times, known) > 0.99 for shifted in shifted_times], axis=0)
+        known = known & (np.interp(before, times, known) > 0.99) & (np.interp(after, times, known) > 0.99)
     return corrected

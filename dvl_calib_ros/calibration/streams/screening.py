@@ -65,8 +65,8 @@ def screened_covariance(covariance: Array | None, believed: bool = True) -> Scre
         return _NOT_GIVEN
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = covariance.tolist()
     if not (min(xx, yy, zz) >= 0.0 and max(xx, yy, zz) < NOT_MEASURED_VARIANCE):
-        valid, given, found, unmeasured = screened_covariances(covariance[None], believed)
-        return Screened(bool(valid[0]), found[0] if given[0] else None, int(unmeasured[0]))
+        one = screened_covariances(covariance[None], believed)
+        return Screened(bool(one.valid[0]), one.covariance[0] if one.given[0] else None, int(one.unmeasured[0]))
     if not math.isfinite(xx + xy + xz + yx + yy + yz + zx + zy + zz):
         return Screened(False, None)
     if min(xx, yy, zz) < SMALLEST_VARIANCE:
@@ -79,8 +79,17 @@ def screened_covariance(covariance: Array | None, believed: bool = True) -> Scre
     return Screened(minor > 0.0 and determinant > 0.0, covariance)
 
 
-def screened_covariances(covariance: Array, believed: bool = True) -> tuple[Mask, Mask, Array, Codes]:
-    """Screen covariances (C, 3, 3): return valid (C,), given (C,), covariance (C, 3, 3), unmeasured (C,)."""
+class ScreenedMatrices(NamedTuple):
+    """`Screened` for C matrices: valid (C,), given (C,), covariance (C, 3, 3), unmeasured (C,)."""
+
+    valid: Mask
+    given: Mask
+    covariance: Array
+    unmeasured: Codes
+
+
+def screened_covariances(covariance: Array, believed: bool = True) -> ScreenedMatrices:
+    """Screen covariances (C, 3, 3), see `screened_covariance`."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     with np.errstate(invalid="ignore", over="ignore"):
         finite = np.isfinite(covariance.reshape(-1, 9).sum(axis=1))
@@ -97,7 +106,7 @@ def screened_covariances(covariance: Array, believed: bool = True) -> tuple[Mask
         determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
         definite = (xx * yy - xy * xy > 0.0) & (determinant > 0.0)
     valid = finite & (smallest >= 0.0) & (definite | ~given)
-    return valid, given, symmetric, (unmeasured * AXIS_BITS).sum(axis=1).astype(np.uint8)
+    return ScreenedMatrices(valid, given, symmetric, (unmeasured * AXIS_BITS).sum(axis=1).astype(np.uint8))
 
 
 def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[bool, bool, bool]:
@@ -139,10 +148,11 @@ class ScreenedColumns(NamedTuple):
 
 def screen_columns(covariances: Covariances, believed: bool = True) -> ScreenedColumns:
     """Screen the covariances of N rows."""
-    valid, given, covariance, unmeasured = screened_covariances(covariances.distinct, believed)
+    each = screened_covariances(covariances.distinct, believed)
+    known = np.where(each.given[:, None, None], each.covariance, np.nan)
     # the last entry is for rows without covariance, whose index is -1
-    valid, unmeasured = np.append(valid, True), np.append(unmeasured, np.uint8(0))
-    covariance = np.concatenate([np.where(given[:, None, None], covariance, np.nan), np.full((1, 3, 3), np.nan)])
+    valid, unmeasured = np.append(each.valid, True), np.append(each.unmeasured, np.uint8(0))
+    covariance = np.concatenate([known, np.full((1, 3, 3), np.nan)])
     return ScreenedColumns(valid[covariances.index], covariance[covariances.index], unmeasured[covariances.index])
 
 
