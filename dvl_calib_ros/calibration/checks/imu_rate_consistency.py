@@ -87,7 +87,7 @@ class AttitudeRates:
             return
         first, last = np.concatenate(pairs, axis=1)
         is_short = times[last] - times[first] <= LONGEST_S
-        spans = _turn_rates(times, orientation, angular_velocity, first[is_short], last[is_short])
+        spans = _span_rates(times, orientation, angular_velocity, first[is_short], last[is_short])
         of_attitude, of_rates, body_from_enu = spans
         self._n += len(of_attitude)
         self._tilted = self._tilted or bool((np.abs(body_from_enu[:, :2, 2]) > LEVEL_BELOW).any())
@@ -148,7 +148,7 @@ class AttitudeRates:
             yield _BODY, rotation, finding("RATES_TURNED", degrees=angle)
 
 
-class _TurnRates(NamedTuple):
+class _SpanRates(NamedTuple):
     """Mean turn rates (S, 3) rad/s over spans, by the attitude (body axes) and by the angular velocity (its axes).
 
     body_from_enu: (S, 3, 3) attitude in the middle.
@@ -159,7 +159,7 @@ class _TurnRates(NamedTuple):
     body_from_enu: Array
 
 
-def _turn_rates(times: Array, orientation: Array, angular_velocity: Array, first: Index, last: Index) -> _TurnRates:
+def _span_rates(times: Array, orientation: Array, angular_velocity: Array, first: Index, last: Index) -> _SpanRates:
     """Return the mean turn rates from samples `first` (S,) to `last` (S,). Streams: see `AttitudeRates.add`."""
     seconds = (times[last] - times[first])[:, None]
     before, after = orientation[first], orientation[last]
@@ -169,7 +169,7 @@ def _turn_rates(times: Array, orientation: Array, angular_velocity: Array, first
     middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
-    return _TurnRates(of_attitude, (angles[last] - angles[first]) / seconds, body_from_enu)
+    return _SpanRates(of_attitude, (angles[last] - angles[first]) / seconds, body_from_enu)
 
 
 def _spans(times: Array) -> Index:

@@ -69,7 +69,7 @@ class SharedNoise:
         differences = np.diff(velocity, ORDER, axis=0)[_windows(_even(times, step), ORDER)]
         self._later += [(differences[lag:] * differences[:-lag]).sum() for lag in _LATER]
         self._square += float((differences**2).sum())
-        compared = _compared(times, step, velocity, reference_times, reference_step, reference)
+        compared = _differences(times, step, velocity, reference_times, reference_step, reference)
         known = np.isfinite(compared.dvl_4) & np.isfinite(compared.reference_4)
         count = np.count_nonzero(known, axis=(1, 2))
         dvl_2, dvl_4, reference_4 = (np.where(known, each, 0.0) for each in compared)
@@ -103,7 +103,7 @@ class SharedNoise:
         return finding("REFERENCE_HOLDS_DVL", percent=100.0 * min(share, 1.0)) if share else None
 
 
-class _Compared(NamedTuple):
+class _Differences(NamedTuple):
     """Differences of simultaneous samples for S shifts, m/s: second and fourth of the DVL, fourth of the reference.
 
     (S or 1, N, 3) each, nan where a sample is missing.
@@ -114,9 +114,9 @@ class _Compared(NamedTuple):
     reference_4: Array
 
 
-def _compared(
+def _differences(
     times: Array, step: float, velocity: Array, reference_times: Array, reference_step: float, reference: Array
-) -> _Compared:
+) -> _Differences:
     """Difference both streams at the slower one's times, with the nearest samples of the faster one.
 
     times, reference_times: s, with usual steps. velocity, reference: see `SharedNoise.add`.
@@ -127,14 +127,14 @@ def _compared(
         orders = np.column_stack([np.column_stack([velocity, second])[2:-2], fourth])
         dvl, dvl_2, dvl_4 = np.split(_nearest(reference_times, step, times[2:-2], orders, -SHIFTS_S), 3, axis=2)
         # equivalent to a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
-        return _Compared(dvl_2, dvl_4, dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl))
+        return _Differences(dvl_2, dvl_4, dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl))
     if reference_step < step:
         dvl_4 = np.where(_evenly(times, step), np.diff(velocity, ORDER, axis=0), np.nan)
         reference_4 = np.diff(_nearest(times, step, reference_times, reference, SHIFTS_S), ORDER, axis=1)
-        return _Compared(np.diff(velocity, 2, axis=0)[None, 1:-1], dvl_4[None], reference_4)
+        return _Differences(np.diff(velocity, 2, axis=0)[None, 1:-1], dvl_4[None], reference_4)
     reference_4 = np.where(_evenly(reference_times, reference_step), np.diff(reference, ORDER, axis=0), np.nan)
     dvl = _nearest(reference_times, reference_step, times, velocity, -SHIFTS_S)
-    return _Compared(np.diff(dvl, 2, axis=1)[:, 1:-1], np.diff(dvl, ORDER, axis=1), reference_4[None])
+    return _Differences(np.diff(dvl, 2, axis=1)[:, 1:-1], np.diff(dvl, ORDER, axis=1), reference_4[None])
 
 
 def _about_mean(values: Array) -> Array:

@@ -139,7 +139,7 @@ def residual_trend(
     """
     if len(time) < 3 or time[-1] - time[0] < FEWEST_VALUES * STRETCH_S:
         return None
-    seen = _Samples(time, rotation_enu_from_body, velocity - error, error, rates, interval_s)
+    seen = _ResidualSamples(time, rotation_enu_from_body, velocity - error, error, rates, interval_s)
     up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # -1 for a z-down body
     roll = np.arctan2(up * rotation_enu_from_body[:, 2, 1], up * rotation_enu_from_body[:, 2, 2])
     pitch = -np.arcsin(np.clip(rotation_enu_from_body[:, 2, 0], -1.0, 1.0))
@@ -175,7 +175,7 @@ def residual_trend(
     )
 
 
-class _Samples(NamedTuple):
+class _ResidualSamples(NamedTuple):
     """N samples: time s, rotation_enu_from_body (N, 3, 3), corrected DVL velocity and error m/s, rates rad/s; body.
 
     error: reference minus DVL. interval_s: sample interval of the reference, s.
@@ -202,7 +202,7 @@ class _SmoothedMotion(NamedTuple):
     bend: Array
 
 
-def _smoothed_motion(seen: _Samples) -> _SmoothedMotion:
+def _smoothed_motion(seen: _ResidualSamples) -> _SmoothedMotion:
     """Smooth the DVL's velocity over BEND_S, and differentiate it over the same time."""
     time, body_from_enu = seen.time, seen.rotation_enu_from_body.swapaxes(1, 2)
     enu = _mean(time, _turned(seen.rotation_enu_from_body, seen.dvl), BEND_S)
@@ -232,7 +232,9 @@ class _FastFit(NamedTuple):
         return np.asarray(values - self.columns @ (self.fit.p @ np.einsum("nij,ni->j", self.columns, weighted)))
 
 
-def _fit_fast_signals(seen: _Samples, smoothed: _SmoothedMotion, changing_tilt: Sequence[Array]) -> _FastFit | None:
+def _fit_fast_signals(
+    seen: _ResidualSamples, smoothed: _SmoothedMotion, changing_tilt: Sequence[Array]
+) -> _FastFit | None:
     """Fit roll, pitch (N,) rad and the second derivative of the velocity to all samples; None for too little data."""
     time, body_from_enu = seen.time, seen.rotation_enu_from_body.swapaxes(1, 2)
     signals = np.zeros((len(time), 3, 3))
@@ -259,7 +261,7 @@ class _MeanFits(NamedTuple):
     bed: _Fit
 
 
-def _fit_means(seen: _Samples, smoothed: _SmoothedMotion) -> _MeanFits | None:
+def _fit_means(seen: _ResidualSamples, smoothed: _SmoothedMotion) -> _MeanFits | None:
     """Fit bias, heading errors and moving bed to means over MEAN_S; None for too little data."""
     time, rotation = seen.time, seen.rotation_enu_from_body
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
@@ -280,7 +282,7 @@ def _fit_means(seen: _Samples, smoothed: _SmoothedMotion) -> _MeanFits | None:
     return None if bias is None or bed is None else _MeanFits(bias, bed)
 
 
-def _over_ground(seen: _Samples, bed: _Fit) -> Array:
+def _over_ground(seen: _ResidualSamples, bed: _Fit) -> Array:
     """Return the velocity (2,) m/s of the bed, east and north; 0 if the residual holds less than half of it.
 
     On few headings yaw and bias can compensate any bed velocity, with a small residual.
@@ -469,7 +471,7 @@ class _KeptNoise(NamedTuple):
 _NO_KEPT_NOISE = _KeptNoise(0.0, math.inf, 0.0)
 
 
-def _noise_in_reference(seen: _Samples, fast: _FastFit) -> _KeptNoise:
+def _noise_in_reference(seen: _ResidualSamples, fast: _FastFit) -> _KeptNoise:
     """Estimate the share of the DVL's noise in the reference, for the most significant memory of a filter.
 
     The innovation of a velocity, given its neighbours, holds its noise. The same filter is applied to the residual, so

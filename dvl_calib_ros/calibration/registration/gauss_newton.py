@@ -143,7 +143,7 @@ class AxisFactors(NamedTuple):
     level: float
 
 
-class _Compared(NamedTuple):
+class _AtDelays(NamedTuple):
     """Streams at the times of the J compared references, for delays ρ and δ.
 
     at: (J,) their indices. body: (J, 3) m/s, B. rates: (J, 3) rad/s, ω. velocity: (J, 3) m/s, v, DVL frame, with its
@@ -319,7 +319,7 @@ class MotionFit:
         columns = compared.rotation_enu_from_body @ in_body if self._motion.in_earth else in_body
         return np.asarray(columns[:, measured])
 
-    def _interpolated(self, rho: float, delta: float, among: Fitted | None = None) -> _Compared | None:
+    def _interpolated(self, rho: float, delta: float, among: Fitted | None = None) -> _AtDelays | None:
         """Return the streams at delays ρ and δ (s), or None for too few references. among: see `__call__`."""
         m = self._motion
         body_at = self.times - rho
@@ -339,7 +339,7 @@ class MotionFit:
         reference_velocity, rotation = self._velocity[rows], rotation[rows]
         body = np.einsum("nji,nj->ni", rotation, reference_velocity) if m.in_earth else reference_velocity
         rates = self._curves.rates(body_at[rows])
-        return _Compared(rows, body, rates, dvl.value[rows], dvl.slope[rows], dvl.slope_gain[rows], rotation)
+        return _AtDelays(rows, body, rates, dvl.value[rows], dvl.slope[rows], dvl.slope_gain[rows], rotation)
 
     def _shared(self, other: Fitted, rho: float, delta: float) -> Mask:
         """Return which of the used references (J,) share DVL samples and attitudes with another fit."""
