@@ -53,8 +53,8 @@ class Assessor:
             MAX_ERROR_RATIO * held_out.predicted, held_out.uncorrected
         )
         typical = self.typical_error(model, state) if is_suspect else None
-        samples, vv, *_ = moments.total
-        return self._judged(estimate, held_out, typical, (float(samples), vv), self._further.suggestion)
+        sums = moments.in_fold(None)
+        return self._judged(estimate, held_out, typical, (float(sums.samples), sums.vv), self._further.suggestion)
 
     def so_far(self, name: str, *, fresh: bool) -> Verification:
         """Return the verdict of a running calibration, by the worker's latest evaluation unless `fresh`."""
@@ -92,20 +92,11 @@ class Assessor:
         model, estimator = MODELS[name], self._estimates.estimators[name]
         of_velocity = self._estimates.of_recording(name).p - estimator.of_bias.covariance
         return verify(
-            model,
-            GaussianState(estimate.state, estimate.covariance),
-            estimate.convergence,
-            held_out,
-            p,
-            (estimate.used, estimate.gated),
-            suggestion if model.aided else None,
-            self._further.reference_claims,
-            self._further.doubt if model.aided else None,
-            bool(model.estimator) and estimator.claims,
-            typical,
-            calibration_error(model, of_velocity, judged, p.rotation_dvl_from_body),
-            drift_left_open(estimate, p),
-        )
+            model, GaussianState(estimate.state, estimate.covariance), estimate.convergence, held_out, p,
+            (estimate.used, estimate.gated), suggestion if model.aided else None, self._further.reference_claims,
+            self._further.doubt if model.aided else None, bool(model.estimator) and estimator.claims, typical,
+            calibration_error(model, of_velocity, judged, p.rotation_dvl_from_body), drift_left_open(estimate, p),
+        )  # fmt: skip
 
     def doubts(self, name: str, of_clocks: Sequence[Reason], *, fresh: bool) -> list[Reason]:
         """Return the reasons against one model's running calibration, weighed by their effect on the verdict.
@@ -208,23 +199,16 @@ class Estimates:
         state, covariance = self.of_recording(name)
         of_bias = estimator.of_bias
         of_velocity = covariance - of_bias.covariance  # repeating the same motion does not reduce the bias
-        used, gated, mean_nis, rows, _ = estimator.counts
+        counts = estimator.counts
         return Estimate(
-            model=name,
-            state=state,
-            covariance=covariance + self._day_covariance(name),
-            recording_covariance=covariance,
-            filter_covariance=estimator.filter_covariance,
-            left_open=estimator.left_open,
-            of_bias=of_bias,
-            used=used,
-            gated=gated,
-            mean_nis=mean_nis,
-            nis_bounds=nis_bounds(rows, self.parameters, used),
+            model=name, state=state, covariance=covariance + self._day_covariance(name),
+            recording_covariance=covariance, filter_covariance=estimator.filter_covariance,
+            left_open=estimator.left_open, of_bias=of_bias, used=counts.used, gated=counts.gated,
+            mean_nis=counts.mean_nis, nis_bounds=nis_bounds(counts.mean_rows, self.parameters, counts.used),
             convergence=convergence(model, of_velocity, self.parameters),
             observability=observability(model, of_velocity, self.parameters),
             heading_deviation=estimator.heading_deviation,
-        )
+        )  # fmt: skip
 
     def of_recording(self, name: str) -> GaussianState:
         """Return the state with σ for this recording: the larger of the filter's and of the scatter of time blocks."""

@@ -25,7 +25,7 @@ from .assessor import Assessor, Estimates, NonlinearEstimators
 from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
 from .filters.build_observations import ROWS_WITH, Observer, RowsSeen, own_copy
 from .filters.filter_bank import Group, groups_of
-from .filters.state_history import Counts, Numbers, StateTrace
+from .filters.state_history import Numbers, PastStates, StateTrace
 from .models import BROKEN, LINEAR_MODELS, MODELS, POSITIONS, Model, Needs
 from .models.parameters import IAC, ParameterError, Parameters
 from .numerics.frames import Array, Vector
@@ -69,8 +69,7 @@ class Calibrator:
     restart. on_rows: receives the aligned rows in order, once all models have had them. on_restart: called at a
     restart, which forgets all samples. verified: keep what hold-out verification needs. trace: filled with the models'
     states over time. recordings_ns: stamps between recordings; each recording is a day of its own. worker: runs slow
-    work in a thread so that live messages do not wait; None runs it immediately, with the same results. registration:
-    registration of the clocks and frames, if already computed.
+    work in a thread so that live messages do not wait; None runs it immediately, with the same results.
     """
 
     def __init__(
@@ -88,7 +87,6 @@ class Calibrator:
         recordings_ns: Sequence[int] = (),
         worker: Executor | None = None,
         models: Collection[str] = tuple(MODELS),
-        registration: Registration | None = None,
     ) -> None:
         if BROKEN:
             raise ParameterError(BROKEN[0])
@@ -109,7 +107,6 @@ class Calibrator:
         self._verified, self._clocks = verified, StreamClocks()
         self._trace = trace
         self._worker = worker
-        self._registration = registration
         self._recordings_ns = recordings_ns
         self._observer = Observer(parameters)
         self._aligner = Aligner(parameters, prior_sway_heave, self._restart, recordings_ns)
@@ -155,19 +152,12 @@ class Calibrator:
     def _made(self, model: Model) -> Estimator:
         """Make the estimator that a model names."""
         together = 1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK)
-        return _KINDS[model.name](
-            EstimatorSetup(
-                model=model,
-                parameters=self.parameters,
-                aligner=self._aligner,
-                initial=(self._initial or {}).get(model.name),
-                on_evidence=partial(self._on_evidence, model),
-                verified=self._verified,
-                worker=self._worker,
-                together=together,
-                registration=self._registration,
-            )
-        )
+        setup = EstimatorSetup(
+            model=model, parameters=self.parameters, aligner=self._aligner,
+            initial=(self._initial or {}).get(model.name), on_evidence=partial(self._on_evidence, model),
+            verified=self._verified, worker=self._worker, together=together,
+        )  # fmt: skip
+        return _KINDS[model.name](setup)
 
     def _before_clearing(self) -> None:
         for each in self._further:
@@ -422,10 +412,8 @@ class Calibrator:
         """Return the state with σ for this recording: the larger of the filter's and of the scatter of time blocks."""
         return self._estimates.of_recording(name)
 
-    def states_at(
-        self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps
-    ) -> tuple[GaussianState, Counts, Array]:
-        """Return x (E, n), P (E, n, n), samples used and sums of νᵀS⁻¹ν (E,) of a model after E rows of a trace."""
+    def states_at(self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> PastStates:
+        """Return the states of a model after E rows of a trace, see `Estimator.states_at`."""
         return self._estimators[name].states_at(trace, numbers, stamps_ns)
 
     def estimate(self, name: str | None = None) -> Estimate:
@@ -471,21 +459,14 @@ class Calibrator:
         """Collect all results as of now."""
         doubts = [] if self._worker is None else self.doubts(fresh=True)
         return Result(
-            selected=self.selected,
-            iac_model=self.selection.iac_model(self.parameters),
+            selected=self.selected, iac_model=self.selection.iac_model(self.parameters),
             selected_because=self.selection.reason(self.parameters),
             estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._reported_models},
-            segments=tuple(self.selection.segments),
-            counts=self.counts,
-            first_ns=self.first_ns,
-            last_ns=self.last_ns,
-            parameters=self.parameters.as_dict(),
-            verifications=self._verifications(doubts),
-            suggestion=self.suggestion,
-            days=self.days,
-            days_of=next((name for name in self._models if self._days_of(name)), ""),
-            doubts=tuple(doubts),
-        )
+            segments=tuple(self.selection.segments), counts=self.counts, first_ns=self.first_ns, last_ns=self.last_ns,
+            parameters=self.parameters.as_dict(), verifications=self._verifications(doubts),
+            suggestion=self.suggestion, days=self.days,
+            days_of=next((name for name in self._models if self._days_of(name)), ""), doubts=tuple(doubts),
+        )  # fmt: skip
 
     def _verifications(self, doubts: Sequence[Reason]) -> dict[str, Verification]:
         """Return verdicts by model; live, only of the selected model, with all reasons against it."""

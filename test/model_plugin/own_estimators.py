@@ -9,6 +9,7 @@ from dvl_calib_ros.calibration.estimators.estimator import Estimator, EstimatorS
 from dvl_calib_ros.calibration.filters.cross_validation import FOLDS
 from dvl_calib_ros.calibration.filters.filter_bank import ModelCounts
 from dvl_calib_ros.calibration.filters.filter_setup import prior
+from dvl_calib_ros.calibration.filters.state_history import PastStates
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.results.thinned_recording import NO_TERMS, Terms
 
@@ -47,7 +48,7 @@ class MeanRise(Estimator):
     def states_at(self, trace, numbers, stamps_ns):
         n, (x, p) = len(stamps_ns), self.state()
         used = np.full(n, self.counts.used)
-        return GaussianState(np.stack([x] * n), np.stack([p] * n)), used, 3.0 * used
+        return PastStates(GaussianState(np.stack([x] * n), np.stack([p] * n)), used, 3.0 * used)
 
     def held_out_error(self, judge, rotation_dvl_from_body):
         return None

@@ -168,19 +168,12 @@ def _information(
     if parameters.is_z_down:
         rotation, rates = rotation @ FLU_FROM_FRD, rates @ FLU_FROM_FRD
     observations = Observations(
-        ahead @ dvl_from_body.T,
-        ahead,
-        None,
-        dvl_from_body,
-        np.zeros(2),
-        noise=motion.noise * np.eye(3)[None],
-        rotation_enu_from_body=rotation,
-        angular_velocity=rates,
-        interval=np.full(len(speed), STEP_S),
+        ahead @ dvl_from_body.T, ahead, None, dvl_from_body, np.zeros(2), noise=motion.noise * np.eye(3)[None],
+        rotation_enu_from_body=rotation, angular_velocity=rates, interval=np.full(len(speed), STEP_S),
         assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
         earth_in_body=rotation.transpose(0, 2, 1)[:, :, :2] if motion.in_earth else None,
         oriented=np.full(len(speed), motion.heading is not None),
-    )
+    )  # fmt: skip
     jacobian = model.linearise(observations)[1]
     design = np.zeros((len(speed), jacobian.shape[1], model.n_state))
     design[:, :, : jacobian.shape[2]] = jacobian

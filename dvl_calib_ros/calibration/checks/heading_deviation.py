@@ -69,14 +69,8 @@ def heading_warning(found: HeadingDeviation) -> Reason:
     is_first = found.rms > max(FIRST, Z_ONE_TEST * found.std)
     first = " first" if is_first else ""
     warning = finding(
-        "HEADING_DEVIATION",
-        rms=degrees(found.rms),
-        std=degrees(found.std),
-        most=degrees(found.most),
-        most_at=degrees(found.most_at),
-        least=degrees(found.least),
-        least_at=degrees(found.least_at),
-        cost=1000.0 * found.rms,
-        first=first,
-    )
+        "HEADING_DEVIATION", rms=degrees(found.rms), std=degrees(found.std), most=degrees(found.most),
+        most_at=degrees(found.most_at), least=degrees(found.least), least_at=degrees(found.least_at),
+        cost=1000.0 * found.rms, first=first,
+    )  # fmt: skip
     return warning.weighed(Severity.REJECT if is_first else Severity.WARNING)

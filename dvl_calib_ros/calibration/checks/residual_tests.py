@@ -22,6 +22,7 @@ import numpy as np
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..models import MODELS
+from ..models.own import heading_cycles
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
@@ -157,22 +158,14 @@ def residual_trend(
     is_observable = is_tilting and fast.bend_gain > LEAST_OF_BEND
     circular = _noise_in_reference(seen, fast)
     return ResidualTrend(
-        tilt=tilt,
-        tilt_std=tilt_std,
-        bias=means.bias.x[-3:],
-        bias_std=means.bias.std[-3:],
+        tilt=tilt, tilt_std=tilt_std, bias=means.bias.x[-3:], bias_std=means.bias.std[-3:],
         smoothed=float(fast.fit.x[-1] / fast.bend_gain) if is_observable else 0.0,
         smoothed_std=float(fast.fit.std[-1] / fast.bend_gain) if is_observable else math.inf,
-        lean=np.array([roll.mean(), pitch.mean()]),
-        speed=math.sqrt(float((velocity**2).sum(axis=1).mean())),
-        circular=circular.share,
-        circular_std=circular.std,
-        circular_s=circular.memory_s,
-        over_ground=_over_ground(seen, means.bed),
-        over_ground_std=means.bed.std[OVER_GROUND],
-        turned=float(means.bias.x[-4]),
-        turned_std=float(means.bias.std[-4]),
-    )
+        lean=np.array([roll.mean(), pitch.mean()]), speed=math.sqrt(float((velocity**2).sum(axis=1).mean())),
+        circular=circular.share, circular_std=circular.std, circular_s=circular.memory_s,
+        over_ground=_over_ground(seen, means.bed), over_ground_std=means.bed.std[OVER_GROUND],
+        turned=float(means.bias.x[-4]), turned_std=float(means.bias.std[-4]),
+    )  # fmt: skip
 
 
 class _ResidualSamples(NamedTuple):
@@ -190,15 +183,13 @@ class _ResidualSamples(NamedTuple):
 
 
 class _SmoothedMotion(NamedTuple):
-    """Smoothed DVL velocity (N, 3) m/s in ENU, the same and its slope in the body, and its bend in ENU.
+    """Smoothed DVL velocity (N, 3) m/s with its slope and bend, its first and second derivative; body axes.
 
-    bend: (N, 3) m/s³, second derivative. The smoothed DVL, because noise of either velocity would correlate with the
-    residual.
+    The DVL's is smoothed, because noise of either velocity would correlate with the residual.
     """
 
-    enu: Array
-    body: Array
-    slope_body: Array
+    velocity: Array
+    slope: Array
     bend: Array
 
 
@@ -207,7 +198,7 @@ def _smoothed_motion(seen: _ResidualSamples) -> _SmoothedMotion:
     time, body_from_enu = seen.time, seen.rotation_enu_from_body.swapaxes(1, 2)
     enu = _mean(time, _turned(seen.rotation_enu_from_body, seen.dvl), BEND_S)
     slope = (linear_at(time, enu, time + BEND_S) - linear_at(time, enu, time - BEND_S)) / (2.0 * BEND_S)
-    return _SmoothedMotion(enu, _turned(body_from_enu, enu), _turned(body_from_enu, slope), _bend(time, enu))
+    return _SmoothedMotion(*(_turned(body_from_enu, each) for each in (enu, slope, _bend(time, enu))))
 
 
 def _bend(time: Array, values: Array) -> Array:
@@ -241,17 +232,16 @@ def _fit_fast_signals(
     for axis, tilt in enumerate(changing_tilt):
         tilt_axis = np.zeros((len(time), 3))
         tilt_axis[:, axis] = -tilt
-        signals[:, :, axis] = cross(tilt_axis, smoothed.body)
+        signals[:, :, axis] = cross(tilt_axis, smoothed.velocity)
     # second derivative of means, so that DVL noise is common to all samples of a mean
     of_means = _mean(time, _turned(seen.rotation_enu_from_body, _mean(time, seen.dvl, MEAN_S)), BEND_S)
     signals[:, :, 2] = _turned(body_from_enu, _bend(time, of_means))
-    whole_bend = _turned(body_from_enu, smoothed.bend)
     # linear interpolation loses this part of the second derivative on average
-    residual = seen.error - seen.interval_s**2 / 12.0 * whole_bend
-    nuisance = _nuisance_columns(smoothed.body, seen.rates, smoothed.slope_body, body_from_enu)
+    residual = seen.error - seen.interval_s**2 / 12.0 * smoothed.bend
+    nuisance = _nuisance_columns(smoothed.velocity, seen.rates, smoothed.slope, body_from_enu)
     columns = np.concatenate([nuisance, signals], axis=2)
     fit = _fitted(time, columns, residual, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
-    return None if fit is None else _FastFit(fit, columns, fit.last_coefficient(columns, whole_bend))
+    return None if fit is None else _FastFit(fit, columns, fit.last_coefficient(columns, smoothed.bend))
 
 
 class _MeanFits(NamedTuple):
@@ -266,11 +256,10 @@ def _fit_means(seen: _ResidualSamples, smoothed: _SmoothedMotion) -> _MeanFits |
     time, rotation = seen.time, seen.rotation_enu_from_body
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
-    moving = _neighbouring_means(time, smoothed.body, starts)
-    nuisance = _nuisance_columns(moving, seen.rates, smoothed.slope_body, rotation.swapaxes(1, 2))
-    yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+    moving = _neighbouring_means(time, smoothed.velocity, starts)
+    nuisance = _nuisance_columns(moving, seen.rates, smoothed.slope, rotation.swapaxes(1, 2))
     progress = (time - time.mean()) / (time[-1] - time[0])
-    heading_terms = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), progress])
+    heading_terms = np.column_stack([heading_cycles(rotation), progress])
     by_heading = nuisance[:, :, -1, None] * heading_terms[:, None]
     by_bias = np.broadcast_to(-np.eye(3), (len(time), 3, 3))
     columns = np.concatenate([_means(each, starts) for each in (nuisance, by_heading, by_bias)], axis=2)

@@ -24,7 +24,7 @@ from ..filters.cross_validation import FOLDS, HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
 from ..filters.filter_setup import prior
 from ..filters.observability import OBSERVED_SHARE, body_angle_std
-from ..filters.state_history import Counts, Numbers, StateTrace
+from ..filters.state_history import Numbers, PastStates, StateTrace
 from ..models.own import BIAS, DELAY, LEVER_ARM, N_STATE, PHI, REFERENCE_ERROR
 from ..numerics.block_covariance import BLOCK_NS
 from ..numerics.frames import Array
@@ -38,7 +38,7 @@ from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .block_solver import BlockSolver, Outcome
-from .estimator import SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup, Residuals
+from .estimator import SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup, Remembered, Residuals, states_in_effect
 from .full_forward_model import deviation_of
 from .slow_errors import Priors
 
@@ -73,10 +73,8 @@ class FullEstimator(Estimator):
         self._on_block = given.on_evidence
         self._unknown = prior(model, parameters)
         self._prior = given.initial or self._unknown
-        self._solver = BlockSolver(
-            parameters, self._prior, self._unknown, given.verified, live=given.worker is not None,
-            registration=given.registration,
-        )  # fmt: skip
+        is_live = given.worker is not None
+        self._solver = BlockSolver(parameters, self._prior, self._unknown, given.verified, live=is_live)
         self._worker = AtOnce() if given.worker is None else given.worker
         # a block is complete after its margin, the longest lag of a stream, and the IMU's timeout
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
@@ -95,7 +93,7 @@ class FullEstimator(Estimator):
         self._is_updating = self._is_settled = False
         self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # cached for each model's verification
         self._suggested: tuple[Outcome, Reason | None] | None = None
-        self._remembered: list[tuple[int, GaussianState, int, float]] = []
+        self._remembered = [Remembered(LONG_AGO_NS, self._prior, 0, 0.0)]
         for track in (aligner.reference, aligner.imu):
             track.needed_from[self] = LONG_AGO_NS  # until the first block is known
 
@@ -151,17 +149,18 @@ class FullEstimator(Estimator):
     @property
     def left_open(self) -> Array:
         """Covariance (n, n) due to the reference's clock offset, which looks like a lever arm, or like yaw in turns."""
-        found: Array = np.zeros((N_STATE, N_STATE))
+        covariance: Array = np.zeros((N_STATE, N_STATE))
         if not self.claims:
-            return found
+            return covariance
         registration = self._solver.registration() if self._is_settled else self._result_in_effect.looked.registration
         if registration is not None:
-            own = np.eye(len(_OPEN))
-            own[:3, :3] = -self._parameters.rotation_dvl_from_body  # rotation and misalignment have opposite signs
-            if any(self._parameters.lever_arm):
-                own[3:] = 0.0
-            found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
-        return 0.5 * (found + found.T)
+            states_from_open = np.eye(len(_OPEN))
+            # rotation and misalignment have opposite signs
+            states_from_open[:3, :3] = -self._parameters.rotation_dvl_from_body
+            if any(self._parameters.lever_arm):  # only the angles remain open
+                states_from_open[3:] = 0.0
+            covariance[np.ix_(_OPEN, _OPEN)] = states_from_open @ registration.left_open @ states_from_open.T
+        return 0.5 * (covariance + covariance.T)
 
     @property
     def of_bias(self) -> BiasCovariance:
@@ -246,27 +245,24 @@ class FullEstimator(Estimator):
         claims a σ that is too small.
         """
         p = self.state().p
-        turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, PHI])  # (lever arm, misalignment)
-        by_arm = (p[PHI, LEVER_ARM] * turns.T).sum(axis=1)
-        rest = np.maximum(np.diag(p)[PHI] - by_arm, 1e-12)
-        if not self.claims or (by_arm / rest).max() < ARM_SHARE:
+        angle_per_metre = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, PHI])  # (lever arm, misalignment)
+        variance_by_arm = (p[PHI, LEVER_ARM] * angle_per_metre.T).sum(axis=1)
+        arm_share = variance_by_arm / np.maximum(np.diag(p)[PHI] - variance_by_arm, 1e-12)
+        if not self.claims or arm_share.max() < ARM_SHARE:
             return None
-        index = int(np.argmax(by_arm / rest))
-        degrees = abs(0.1 * math.degrees(np.abs(turns[:, index]).max()))
+        index = int(np.argmax(arm_share))
+        degrees = abs(0.1 * math.degrees(np.abs(angle_per_metre[:, index]).max()))
         return finding("ARM_LOOKS_LIKE_ANGLE", metres=0.1, degrees=degrees, angle=("roll", "pitch", "yaw")[index])
 
     def remember(self, from_ns: int) -> None:
         """Keep the current state for `states_at`."""
-        used, _, mean_nis, _, _ = self._result_in_effect.counts
-        self._remembered.append((from_ns, self.state(), used, used * mean_nis if used else 0.0))
+        counts = self._result_in_effect.counts
+        nis_sum = counts.used * counts.mean_nis if counts.used else 0.0
+        self._remembered.append(Remembered(from_ns, self.state(), counts.used, nis_sum))
 
-    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
+    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> PastStates:
         """See `Estimator`."""
-        rows = [(LONG_AGO_NS, self._prior, 0, 0.0), *self._remembered]
-        at = np.searchsorted([row[0] for row in rows], stamps_ns, side="right") - 1
-        told = [rows[index] for index in at.tolist()]
-        states = GaussianState(np.array([row[1].x for row in told]), np.array([row[1].p for row in told]))
-        return states, np.array([row[2] for row in told]), np.array([row[3] for row in told])
+        return states_in_effect(self._remembered, stamps_ns)
 
     @contextmanager
     def settled(self) -> Iterator[None]:
@@ -389,17 +385,12 @@ class FullEstimator(Estimator):
         from_ns, to_ns = block_ns - MARGIN_NS, end_ns + MARGIN_NS
         rows = dvl.between(dvl.stamps_ns, from_ns, to_ns)
         at, turned = reference.in_time(from_ns, to_ns), imu.in_time(from_ns, to_ns)
+        columns = reference.stamps_ns, reference.values, reference.frames, reference.unmeasured
         return Block(
-            block_ns,
-            end_ns,
-            self._new_days(block_ns),
-            not is_last and self._dvl_is_silent(end_ns),
+            block_ns, end_ns, self._new_days(block_ns), not is_last and self._dvl_is_silent(end_ns),
             DvlSamples(dvl.stamps_ns[rows].copy(), dvl.velocity[rows].copy(), dvl.covariance[rows].copy()),
-            ReferenceSamples(
-                reference.stamps_ns[at], reference.values[at], reference.frames[at], reference.unmeasured[at]
-            ),
-            ImuSamples(imu.stamps_ns[turned], imu.values[turned]),
-        )
+            ReferenceSamples(*columns).part(at), ImuSamples(imu.stamps_ns[turned], imu.values[turned]),
+        )  # fmt: skip
 
     def _new_days(self, block_ns: int) -> int:
         """Count the days that begin with a block, which may hold delayed references of a day's first DVL sample."""
@@ -484,22 +475,29 @@ class FullEstimator(Estimator):
 
     def days_from(self, first_ns: Sequence[int]) -> tuple[Day, ...]:
         """See `Estimator`."""
-        nominal, days = self._parameters.dvl_time_offset, []
-        known, offset = self._unknown.p[DELAY, DELAY], np.arange(N_STATE)[REFERENCE_ERROR][:2]
+        days = []
         states = self._result_in_effect.days if self._day_starts_ns else ()
-        for begins_ns, (x, p) in zip(first_ns, states, strict=False):
+        for begins_ns, (x, p) in zip(first_ns, states, strict=False):  # the newest day may have no estimate yet
             std = np.sqrt(np.diag(p))
-            (east, north), (east_std, north_std) = x[offset].tolist(), std[offset].tolist()
-            shown = bool(p[DELAY, DELAY] <= OBSERVED_SHARE**2 * known)
-            late = nominal + float(x[DELAY])
-            days.append(Day(begins_ns, late, float(std[DELAY]), shown, (east, north), (east_std, north_std)))
+            east, north, _ = x[REFERENCE_ERROR].tolist()
+            east_std, north_std, _ = std[REFERENCE_ERROR].tolist()
+            day = Day(
+                first_ns=begins_ns, dvl_time_offset=self._parameters.dvl_time_offset + float(x[DELAY]),
+                dvl_time_offset_std=float(std[DELAY]),
+                shown=bool(p[DELAY, DELAY] <= OBSERVED_SHARE**2 * self._unknown.p[DELAY, DELAY]),
+                reference_offset=(east, north), reference_offset_std=(east_std, north_std),
+            )  # fmt: skip
+            days.append(day)
         return tuple(days)
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
         """Return, per fold and day, the corrections estimated without that fold."""
         if not self.claims:
             return [[NO_TERMS] * n_days] * FOLDS
-        return [[Terms.of_state(state.x) for state in states] for states in self._idle_solver().fit.without_folds()]
+        terms = []
+        for states_of_days in self._idle_solver().fit.without_folds():
+            terms.append([Terms.of_state(state.x) for state in states_of_days])
+        return terms
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
         """Return the velocity error on every fold, each by the state without it; None for too few samples."""

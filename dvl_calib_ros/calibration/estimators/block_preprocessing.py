@@ -28,21 +28,19 @@ LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 class Cleaned(NamedTuple):
     """Samples of a block, without outliers.
 
-    raw: its references (J,) from the messages, thinned. own: their indices in the block. reference: without outliers.
-    dvl: without outliers. binned_dvl: for interpolation. dvl_ns, reference_ns: stamps. noise_dvl: (3, 3) (m/s)², mean
-    covariance. own_dvl, own_imu: the block's own samples, without margins. are_compared: whether it has references and
-    DVL data for them.
+    raw: its references (J,) from the messages, thinned. reference: without outliers, with their stamps reference_ns.
+    dvl: without outliers. binned_dvl: for interpolation. noise_dvl: (3, 3) (m/s)², mean covariance. reference_spikes,
+    dvl_spikes: number of outliers within the block. own_dvl, own_imu: the block's own samples, without margins.
+    are_compared: whether it has references and DVL data for them; else DVL and IMU are empty.
     """
 
     block: Block
     raw: ReferenceSamples
-    own: Index
     reference: ReferenceColumns
     reference_ns: Stamps
     reference_spikes: int
     dvl: DvlColumns
     binned_dvl: DvlColumns
-    dvl_ns: Stamps
     dvl_spikes: int
     noise_dvl: Array
     imu: ImuColumns
@@ -59,36 +57,36 @@ def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
         block = block._replace(reference=around._replace(values=np.hstack([velocity, around.values[:, 3:]])))
     own = _own(block)
     raw = block.reference.part(own)
-    reference, good = _reference(block, own, raw, parameters, epoch_ns)
-    noise_dvl: Array = np.eye(3)
-    dvl, dvl_ns, dvl_spikes = DvlColumns(np.zeros(0), np.zeros((0, 3))), block.dvl.stamps_ns[:0], 0
-    imu = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
+    good = _good(block.reference.stamps_ns, _measured_velocity(block.reference))[own]
+    reference = _reference(raw.part(np.flatnonzero(good)), parameters, epoch_ns)
     are_compared = len(reference.times) > 0 and not block.silent
-    if are_compared:
-        dvl, noise_dvl, dvl_ns, dvl_spikes = _dvl_columns(block, parameters, epoch_ns)
-        imu = _imu(block.imu, epoch_ns)
+    cleaned_dvl = _cleaned_dvl(block, parameters, epoch_ns) if are_compared else _NO_DVL
+    imu = _imu(block.imu, epoch_ns) if are_compared else _NO_IMU
+    dvl = cleaned_dvl.dvl
     from_s, to_s = seconds(np.array([block.from_ns, block.end_ns]), epoch_ns).tolist()
     return Cleaned(
-        block=block,
-        raw=raw,
-        own=own,
-        reference=reference,
-        reference_ns=raw.stamps_ns[good],
-        reference_spikes=int(np.count_nonzero(~good)),
-        dvl=dvl,
-        binned_dvl=dvl if is_slow(dvl.times) else DvlColumns(*binned(*dvl)),
-        dvl_ns=dvl_ns,
-        dvl_spikes=dvl_spikes,
-        noise_dvl=noise_dvl,
-        imu=imu,
-        own_dvl=slice(*np.searchsorted(dvl.times, (from_s, to_s)).tolist()),
-        own_imu=slice(*np.searchsorted(imu.times, (from_s, to_s)).tolist()),
-        are_compared=are_compared,
-    )
+        block=block, raw=raw, reference=reference, reference_ns=raw.stamps_ns[good],
+        reference_spikes=int(np.count_nonzero(~good)), dvl=dvl,
+        binned_dvl=dvl if is_slow(dvl.times) else DvlColumns(*binned(*dvl)), dvl_spikes=cleaned_dvl.n_spikes,
+        noise_dvl=cleaned_dvl.noise, imu=imu, own_dvl=slice(*np.searchsorted(dvl.times, (from_s, to_s)).tolist()),
+        own_imu=slice(*np.searchsorted(imu.times, (from_s, to_s)).tolist()), are_compared=are_compared,
+    )  # fmt: skip
 
 
-def _dvl_columns(block: Block, p: Parameters, epoch_ns: int) -> tuple[DvlColumns, Array, Stamps, int]:
-    """Return DVL samples without outliers, mean covariance (3, 3), stamps (N,), and number of outliers."""
+class _CleanedDvl(NamedTuple):
+    """DVL samples without outliers, mean covariance (3, 3) (m/s)², and number of outliers within the block."""
+
+    dvl: DvlColumns
+    noise: Array
+    n_spikes: int
+
+
+_NO_DVL = _CleanedDvl(DvlColumns(np.zeros(0), np.zeros((0, 3))), np.eye(3), 0)
+_NO_IMU = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
+
+
+def _cleaned_dvl(block: Block, p: Parameters, epoch_ns: int) -> _CleanedDvl:
+    """Return the DVL samples of a block and its margins without outliers."""
     stamps_ns, velocity, covariance = block.dvl
     # an outlier distorts interpolation for all references near it, which no gate would detect
     good = _good(stamps_ns, velocity)
@@ -101,7 +99,7 @@ def _dvl_columns(block: Block, p: Parameters, epoch_ns: int) -> tuple[DvlColumns
     noise: Array = np.eye(3) * p.gnss_free_std**2
     if given.any() and p.use_message_covariance:
         noise = covariance[given].mean(axis=0)
-    return DvlColumns(seconds(stamps_ns, epoch_ns), velocity), noise, stamps_ns, n_spikes
+    return _CleanedDvl(DvlColumns(seconds(stamps_ns, epoch_ns), velocity), noise, n_spikes)
 
 
 def _imu(samples: ImuSamples, epoch_ns: int) -> ImuColumns:
@@ -109,33 +107,28 @@ def _imu(samples: ImuSamples, epoch_ns: int) -> ImuColumns:
     return ImuColumns(seconds(samples.stamps_ns, epoch_ns), values[:, :4], values[:, 4:7])
 
 
-def _reference(
-    block: Block, own: Index, raw: ReferenceSamples, p: Parameters, epoch_ns: int
-) -> tuple[ReferenceColumns, Mask]:
-    """Return references without outliers, and which (J,) of the thinned ones these are.
+def _measured_velocity(samples: ReferenceSamples) -> Array:
+    """Return velocities (J, 3) m/s with 0 along unmeasured axes."""
+    if not samples.unmeasured.any():
+        return samples.values[:, :3]
+    return np.where((samples.unmeasured[:, None] & AXIS_BITS) == 0, samples.values[:, :3], 0.0)
 
-    own: indices of these in the block. raw: the thinned references.
-    """
-    around = block.reference
-    velocity = around.values[:, :3]
-    if around.unmeasured.any():
-        velocity = np.where((around.unmeasured[:, None] & AXIS_BITS) == 0, velocity, 0.0)
-    good = _good(around.stamps_ns, velocity)[own]
-    stamps_ns, values, frames, unmeasured = raw if good.all() else raw.part(np.flatnonzero(good))
+
+def _reference(samples: ReferenceSamples, p: Parameters, epoch_ns: int) -> ReferenceColumns:
+    """Return references in ENU or body axes, with the noise of their messages or the parameter's."""
+    stamps_ns, values, frames, unmeasured = samples
     noise = values[:, 3:12].reshape(-1, 3, 3)
     given = ~np.isnan(noise[:, 0, 0]) & p.use_message_covariance
     noise = np.where(given[:, None, None], noise, np.eye(3) * p.gnss_aided_std**2)
-    velocity, ned = values[:, :3], frames == _NED
+    velocity, ned = _measured_velocity(samples), frames == _NED
     if unmeasured.any():
         axes = (unmeasured[:, None] & AXIS_BITS) != 0
-        velocity = np.where(axes, 0.0, velocity)
-        noise = np.where(axes[:, :, None] | axes[:, None, :], 0.0, noise) + np.eye(3) * np.where(
-            axes[:, :, None], NOT_MEASURED, 0.0
-        )
+        of_measured = np.where(axes[:, :, None] | axes[:, None, :], 0.0, noise)
+        noise = of_measured + np.eye(3) * np.where(axes[:, :, None], NOT_MEASURED, 0.0)
     if ned.any():
         velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
         noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
-    return ReferenceColumns(seconds(stamps_ns, epoch_ns), velocity, noise, frames == _BODY, given), good
+    return ReferenceColumns(seconds(stamps_ns, epoch_ns), velocity, noise, frames == _BODY, given)
 
 
 def _own(block: Block) -> Index:

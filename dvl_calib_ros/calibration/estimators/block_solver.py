@@ -68,19 +68,12 @@ class BlockSolver:
     """
 
     def __init__(
-        self,
-        parameters: Parameters,
-        prior: GaussianState,
-        unknown: GaussianState,
-        verified: bool,
-        *,
-        live: bool = False,
-        registration: Registration | None = None,
+        self, parameters: Parameters, prior: GaussianState, unknown: GaussianState, verified: bool, *, live: bool
     ) -> None:
         """Start from priors; `FullEstimator` sets `epoch_ns`, the stamp of time 0.
 
         prior: x, P of the states. unknown: prior of the per-day states on further days. live: repeat the registration
-        during the run. registration: registration of clocks and frames, if already computed.
+        during the run.
         """
         self._parameters = parameters
         self.fit = JointFit(parameters, prior, unknown)
@@ -91,7 +84,7 @@ class BlockSolver:
         self._seen_ahead = self._seen_upwards = False  # whether references measure these body axes
         self._dvl_stream = DvlStream()
         self._turned = False
-        self._clocks = KeptClocks(parameters, live, registration)
+        self._clocks = KeptClocks(parameters, live)
         self._is_live = live
         self._claims = 0  # references
         self._spikes = 0  # samples of DVL and reference

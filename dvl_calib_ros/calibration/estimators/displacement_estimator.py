@@ -20,13 +20,14 @@ from ..assessment.model_selection import NO_EVIDENCE, Evidence
 from ..filters.cross_validation import FOLDS, HeldOutError, Moments, held_out_from_sums
 from ..filters.filter_bank import ModelCounts
 from ..filters.filter_setup import prior
-from ..filters.state_history import Counts, Numbers, StateTrace
+from ..filters.state_history import Numbers, PastStates, StateTrace
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
 from ..results.thinned_recording import Terms
 from ..streams.position_velocities import NOISY_MPS, are_positions
+from ..streams.stream_order import LONG_AGO_NS
 from .displacement_least_squares import (
     N_ERRORS,
     DeadReckoning,
@@ -37,7 +38,7 @@ from .displacement_least_squares import (
     solve,
     white_noise,
 )
-from .estimator import NEVER, SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup
+from .estimator import NEVER, SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup, Remembered, states_in_effect
 
 # Time of the first solution, s, and growth of the run between solutions.
 FIRST_LOOK_S, GROWTH = 60.0, 1.2
@@ -54,6 +55,22 @@ class _Look(NamedTuple):
 
 
 NO_LOOK = _Look(None, 0.0)
+
+
+class HeldOutLegs(NamedTuple):
+    """N fixes, the number (N,) of the held-out leg of each, and the errors (4,) estimated without each fold.
+
+    Held-out legs are assigned to the folds in turn.
+    """
+
+    legs: Legs
+    numbers: Index
+    states: Sequence[GaussianState]
+
+    @property
+    def folds(self) -> Index:
+        """Fold (N,) of each fix."""
+        return self.numbers % len(self.states)
 
 
 class Displacements(Estimator):
@@ -73,10 +90,10 @@ class Displacements(Estimator):
         self._coming: deque[tuple[int, Future[_Look]]] = deque()
         self._last_result = NO_LOOK
         self._n_updates = 0
-        self._newest: tuple[int, DisplacementFit | None] = (0, None)  # of all legs, with their number
-        self._folds: tuple[int, tuple[Legs, Index, list[GaussianState]]] | None = None  # with the number of fixes
+        self._newest: tuple[int, DisplacementFit | None] = (0, None)  # number of legs, and their fit
+        self._held_out: HeldOutLegs | None = None  # cached for the number of fixes
         self._is_settled = False
-        self._remembered: list[tuple[int, GaussianState, int]] = []
+        self._remembered = [Remembered(LONG_AGO_NS, self._start, 0, 0.0)]
 
     # ------------------------------------------------------------------ input
 
@@ -195,57 +212,47 @@ class Displacements(Estimator):
 
     def remember(self, from_ns: int) -> None:
         """See `Estimator`."""
-        self._remembered.append((from_ns, self.state(), self.counts.used))
+        used = self.counts.used
+        # no innovations are kept: the expected νᵀS⁻¹ν of two components, as in `counts`
+        self._remembered.append(Remembered(from_ns, self.state(), used, 2.0 * used))
 
-    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
+    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> PastStates:
         """See `Estimator`."""
-        at = np.searchsorted([row[0] for row in self._remembered], stamps_ns, side="right")
-        known = [(self._start, 0), *((state, used) for _, state, used in self._remembered)]
-        states, used = zip(*(known[place] for place in at.tolist()), strict=True)
-        of_each: Counts = np.array(used, dtype=np.int64)
-        return (
-            GaussianState(np.array([each.x for each in states]), np.array([each.p for each in states])),
-            of_each,
-            2.0 * of_each,  # the expected sum of two components per sample: no innovations are kept
-        )
+        return states_in_effect(self._remembered, stamps_ns)
 
     # ------------------------------------------------------------------ verification
 
-    def _without_folds(self) -> tuple[Legs, Index, list[GaussianState]]:
-        """Return all fixes, the leg (N,) of each, and the errors estimated without each fold (every fifth leg)."""
+    def _without_folds(self) -> HeldOutLegs:
+        """Return all fixes with the errors estimated without each fold, computed once per number of fixes."""
         self.take_rows()
         legs = self._reckoning.legs()
-        if self._folds is None or self._folds[0] != len(legs.seconds):
+        if self._held_out is None or len(self._held_out.legs.seconds) != len(legs.seconds):
             numbers = np.floor(legs.seconds / leg_length_s(legs)).astype(np.intp)
-            fits = [
-                solve(legs.part(np.flatnonzero(numbers % FOLDS != fold)), self._parameters, self._start)
-                for fold in range(FOLDS)
-            ]
-            states = [self._start if fit is None else fit.errors for fit in fits]
-            self._folds = len(legs.seconds), (legs, numbers, states)
-        return self._folds[1]
+            states = []
+            for fold in range(FOLDS):
+                fit = solve(legs.part(np.flatnonzero(numbers % FOLDS != fold)), self._parameters, self._start)
+                states.append(self._start if fit is None else fit.errors)
+            self._held_out = HeldOutLegs(legs, numbers, states)
+        return self._held_out
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
         """Return the held-out error of mean velocities over legs of positions; None without a fit."""
         fit = self._fit()
         if fit is None:
             return None
-        legs, numbers, states = self._without_folds()
-        return held_out(legs, numbers, states, fit, self._parameters)
+        return held_out(self._without_folds(), fit, self._parameters)
 
     def navigation(self) -> Navigation | None:
         """Return the drift of dead reckoning by positions; None without a fit."""
         fit = self._fit()
         if fit is None or self._first_ns is None:
             return None
-        legs, numbers, states = self._without_folds()
-        return navigated(legs, numbers, states, fit, self._parameters, self._first_ns)
+        return navigated(self._without_folds(), fit, self._parameters, self._first_ns)
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
         """See `Estimator`."""
         terms = self._model.error_terms_from_state
-        _, _, states = self._without_folds()
-        return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * n_days for state in states]
+        return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * n_days for state in self._without_folds().states]
 
 
 def _noise_of_velocities(legs: Legs, parameters: Parameters) -> float:
@@ -263,74 +270,64 @@ def _noise_of_velocities(legs: Legs, parameters: Parameters) -> float:
 LEG_S = 60.0
 
 
-def navigated(
-    legs: Legs,
-    numbers: Index,
-    states: Sequence[GaussianState],
-    fit: DisplacementFit,
-    parameters: Parameters,
-    first_ns: int,
-) -> Navigation | None:
+def navigated(held: HeldOutLegs, fit: DisplacementFit, parameters: Parameters, first_ns: int) -> Navigation | None:
     """Return the track at all fixes without outliers; None with hardly any motion.
 
-    numbers, states: see `held_out`. first_ns: stamp of the legs' time 0. Lever arm, delay and heading deviation are
-    from all data in both tracks, so they differ by mounting and scale only.
+    first_ns: stamp of the legs' time 0. Lever arm, delay and heading deviation are from all data in both tracks, so
+    they differ by mounting and scale only.
     """
-    at = np.flatnonzero(fit.used)
+    legs, at = held.legs, np.flatnonzero(fit.used)
     if len(at) < 2:
         return None
     seconds = legs.seconds[at]
     goes_on = np.diff(legs.stretch[at]) == 0
-    step_s = np.append(0.0, np.where(goes_on, np.diff(seconds), 0.0))
 
     def steps(values: Array) -> Array:
+        """Return the horizontal change (K, 2) of values (N, 3) since the fix before; zero between stretches."""
         return np.concatenate([np.zeros((1, 2)), np.diff(values[at, :2], axis=0) * goes_on[:, None]])
 
-    def left(errors: Array) -> Array:
-        theta = np.concatenate([errors, fit.state.x[N_ERRORS:]])
-        linear = linear_about(legs, theta, parameters)
-        return linear.y - linear.columns @ theta
-
-    of_all = left(fit.errors.x)
-    before, after = steps(left(np.zeros(N_ERRORS))), np.zeros((len(at), 2))
-    for fold, state in enumerate(states):
-        own = numbers[at] % len(states) == fold
-        after[own] = steps(left(state.x))[own]
     moved = steps(np.einsum("nabc,bc->na", legs.way, parameters.rotation_dvl_from_body.T))
     distance = np.cumsum(np.linalg.norm(moved, axis=1))
     if distance[-1] < SHORTEST_M:
         return None
-    ends = ends_of_stretches(distance)
-    astray = [np.cumsum(each, axis=0) for each in (before, after)]
+    before = steps(_position_errors(legs, fit, np.zeros(N_ERRORS), parameters))
+    after = np.zeros((len(at), 2))
+    for fold, state in enumerate(held.states):
+        own = held.folds[at] == fold
+        after[own] = steps(_position_errors(legs, fit, state.x, parameters))[own]
+    track_errors = [np.cumsum(each, axis=0) for each in (before, after)]
+    residual = _position_errors(legs, fit, fit.errors.x, parameters)[at, :2]
     reference = np.cumsum(steps(legs.position), axis=0)
+    ends = ends_of_stretches(distance)
     stretch_m = float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]])
-    noise = float(np.sqrt(2.0 * np.var(of_all[at, :2], axis=0).sum()))
     kept = np.round(np.linspace(0, len(at) - 1, min(MAP_POINTS, len(at)))).astype(np.intp)
-    in_body = [_velocities(each, seconds, legs.rotation[at])[kept] for each in astray]
+    in_body = [_velocities(each, seconds, legs.rotation[at])[kept] for each in track_errors]
     return Navigation(
-        distance_m=float(distance[-1]),
-        seconds=float(step_s.sum()),
-        stretch_m=stretch_m,
-        stretches=len(ends) - 1,
-        before=drift_over(astray[0], distance, ends),
-        after=drift_over(astray[1], distance, ends),
-        noise_per_km=1000.0 * noise / stretch_m,
-        on_a_map=True,
-        stamps_ns=first_ns + np.round(seconds[kept] * 1e9).astype(np.int64),
-        distances=distance[kept],
-        reference=reference[kept],
-        track_before=(reference - astray[0])[kept],
-        track_after=(reference - astray[1])[kept],
-        error_before=in_body[0],
-        error_after=in_body[1],
-    )
+        distance_m=float(distance[-1]), seconds=float(np.append(0.0, np.where(goes_on, np.diff(seconds), 0.0)).sum()),
+        stretch_m=stretch_m, stretches=len(ends) - 1, before=drift_over(track_errors[0], distance, ends),
+        after=drift_over(track_errors[1], distance, ends),
+        noise_per_km=1000.0 * float(np.sqrt(2.0 * np.var(residual, axis=0).sum())) / stretch_m, on_a_map=True,
+        stamps_ns=first_ns + np.round(seconds[kept] * 1e9).astype(np.int64), distances=distance[kept],
+        reference=reference[kept], track_before=(reference - track_errors[0])[kept],
+        track_after=(reference - track_errors[1])[kept], error_before=in_body[0], error_after=in_body[1],
+    )  # fmt: skip
 
 
-def _velocities(astray: Array, seconds: Array, rotation_enu_from_body: Array) -> Array:
+def _position_errors(legs: Legs, fit: DisplacementFit, errors: Array, parameters: Parameters) -> Array:
+    """Return fixes minus corrected dead reckoning (N, 3) m, constant per stretch included.
+
+    errors: (4,) misalignment and scale; all other corrections are from the fit.
+    """
+    theta = np.concatenate([errors, fit.state.x[N_ERRORS:]])
+    linear = linear_about(legs, theta, parameters)
+    return linear.y - linear.columns @ theta
+
+
+def _velocities(track_error: Array, seconds: Array, rotation_enu_from_body: Array) -> Array:
     """Return mean velocity errors (N, 3) m/s, body axes, over `LEG_S` before each fix, from track errors (N, 2) m."""
     since = np.searchsorted(seconds, seconds - LEG_S)
     passed = np.maximum(seconds - seconds[since], 1.0)[:, None]
-    enu = np.concatenate([(astray - astray[since]) / passed, np.zeros((len(seconds), 1))], axis=1)
+    enu = np.concatenate([(track_error - track_error[since]) / passed, np.zeros((len(seconds), 1))], axis=1)
     return np.asarray(np.einsum("nji,nj->ni", rotation_enu_from_body, enu))
 
 
@@ -347,68 +344,74 @@ def leg_length_s(legs: Legs) -> float:
     return max(SHORTEST_LEG_S, span_s / MOST_LEGS, min(LEG_S, span_s / LEGS))
 
 
-def held_out(
-    legs: Legs, numbers: Index, states: Sequence[GaussianState], fit: DisplacementFit, parameters: Parameters
-) -> HeldOutError | None:
-    """Return the error of mean velocities over legs, m/s, each by the state of `states` fitted without it.
+class _LegEnds(NamedTuple):
+    """Indices of the fixes at the beginning and at the end of a held-out leg."""
 
-    numbers: (N,) leg of each fix; legs are assigned to the states in turn. The predicted error holds the residual of
-    the fit of all data, and the estimate's covariance.
+    first: Index
+    last: Index
+
+
+def held_out(held: HeldOutLegs, fit: DisplacementFit, parameters: Parameters) -> HeldOutError | None:
+    """Return the error of mean velocities over held-out legs, m/s, each by the errors fitted without its fold.
+
+    The predicted error holds the residual of the fit of all data, and the estimate's covariance. Lever arm, delay and
+    heading are from all data: only mounting and scale are tested.
     """
-    ends = _ends(legs, numbers, fit)
+    legs, ends = held.legs, _ends(held, fit)
     if not len(ends):
         return None
+    fold_of_leg = held.folds[[each.first[0] for each in ends]]
+    of_all = _velocity_errors(legs, ends, fit, fit.errors.x, parameters)
+    before = _velocity_errors(legs, ends, fit, np.zeros(N_ERRORS), parameters)
     sums = np.zeros(5)
-    rest = fit.state.x.copy()
-    rest[:N_ERRORS] = 0.0  # lever arm, delay and heading from all data; only mounting and scale are tested
-    of_all = _velocity_errors(legs, ends, fit.state.x, parameters)
-    before = _velocity_errors(legs, ends, rest, parameters)
-    for fold, state in enumerate(states):
-        own = np.array([numbers[first[0]] % len(states) == fold for first, _ in ends])
+    for fold, state in enumerate(held.states):
+        own = fold_of_leg == fold
         if not own.any():
             continue
-        theta = fit.state.x.copy()
-        theta[:N_ERRORS] = state.x
-        after = _velocity_errors(legs, ends, theta, parameters)[own]
-        jacobian = _jacobian(legs, [each for each, is_own in zip(ends, own, strict=True) if is_own], theta, parameters)
+        own_ends = [each for each, is_own in zip(ends, own, strict=True) if is_own]
+        after = _velocity_errors(legs, ends, fit, state.x, parameters)[own]
+        jacobian = _jacobian(legs, own_ends, fit, state.x, parameters)
         calibration = float(np.einsum("nij,jk,nik->", jacobian, state.p, jacobian))
         noise = float((of_all[own] ** 2).sum())
         sums += [float((before[own] ** 2).sum()), float((after**2).sum()), noise + calibration, calibration, 0.0]
     return held_out_from_sums(len(ends), sums)
 
 
-def _ends(legs: Legs, numbers: Index, fit: DisplacementFit) -> list[tuple[Index, Index]]:
-    """Return the fixes at both ends of each leg, in one stretch and without outliers."""
-    length = leg_length_s(legs)
+def _ends(held: HeldOutLegs, fit: DisplacementFit) -> list[_LegEnds]:
+    """Return the fixes at both ends of each held-out leg, in one stretch and without outliers."""
+    legs = held.legs
+    length_s = leg_length_s(legs)
     at = np.flatnonzero(fit.used)
-    key = np.stack([legs.stretch[at], numbers[at]])
+    key = np.stack([legs.stretch[at], held.numbers[at]])
     found = []
     for part in np.split(at, np.flatnonzero((np.diff(key, axis=1) != 0).any(axis=0)) + 1):
         seconds = legs.seconds[part]
-        if len(part) < 2 or seconds[-1] - seconds[0] < 0.5 * length:
+        if len(part) < 2 or seconds[-1] - seconds[0] < 0.5 * length_s:
             continue
-        reach = END_SHARE * (seconds[-1] - seconds[0])
-        found.append((part[seconds <= seconds[0] + reach], part[seconds >= seconds[-1] - reach]))
+        reach_s = END_SHARE * (seconds[-1] - seconds[0])
+        found.append(_LegEnds(part[seconds <= seconds[0] + reach_s], part[seconds >= seconds[-1] - reach_s]))
     return found
 
 
-def _between(values: Array, legs: Legs, ends: Sequence[tuple[Index, Index]]) -> Array:
-    """Return the change per second of values (N, ...) from start to end of each leg."""
-    return np.array(
-        [
-            (values[last].mean(axis=0) - values[first].mean(axis=0))
-            / (legs.seconds[last].mean() - legs.seconds[first].mean())
-            for first, last in ends
-        ]
-    )
+def _rates(values: Array, legs: Legs, ends: Sequence[_LegEnds]) -> Array:
+    """Return the change per second (L, ...) of values (N, ...) of fixes, from start to end of each leg."""
+    rates = []
+    for first, last in ends:
+        seconds = legs.seconds[last].mean() - legs.seconds[first].mean()
+        rates.append((values[last].mean(axis=0) - values[first].mean(axis=0)) / seconds)
+    return np.array(rates)
 
 
-def _velocity_errors(legs: Legs, ends: Sequence[tuple[Index, Index]], theta: Array, parameters: Parameters) -> Array:
-    linear = linear_about(legs, theta, parameters)
-    return _between((linear.y - linear.columns @ theta)[:, :2], legs, ends)
+def _velocity_errors(
+    legs: Legs, ends: Sequence[_LegEnds], fit: DisplacementFit, errors: Array, parameters: Parameters
+) -> Array:
+    """Return the error (L, 2) m/s of each leg's mean velocity, east and north. errors: see `_position_errors`."""
+    return _rates(_position_errors(legs, fit, errors, parameters)[:, :2], legs, ends)
 
 
-def _jacobian(legs: Legs, ends: Sequence[tuple[Index, Index]], theta: Array, parameters: Parameters) -> Array:
-    """Return the derivative (L, 2, 4) of leg velocities by the errors."""
-    columns = linear_about(legs, theta, parameters).columns[:, :2, :N_ERRORS]
-    return _between(columns, legs, ends)
+def _jacobian(
+    legs: Legs, ends: Sequence[_LegEnds], fit: DisplacementFit, errors: Array, parameters: Parameters
+) -> Array:
+    """Return the derivative (L, 2, 4) of leg velocities by the errors, about errors (4,)."""
+    theta = np.concatenate([errors, fit.state.x[N_ERRORS:]])
+    return _rates(linear_about(legs, theta, parameters).columns[:, :2, :N_ERRORS], legs, ends)

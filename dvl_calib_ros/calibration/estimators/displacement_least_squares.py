@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..models.own import heading_cycles
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import BLOCK_S
 from ..numerics.error_model import correction_matrix
@@ -49,10 +50,9 @@ MIN_NOISE_M = 0.3
 
 
 class DisplacementFit(NamedTuple):
-    """Fit of all legs: θ (13,) with covariance, white σ (m) of a fix per axis, and which fixes (N,) are used."""
+    """Fit of all legs: θ (13,) with covariance, and which fixes (N,) are used."""
 
     state: GaussianState
-    noise_m: float
     used: Mask
 
     @property
@@ -113,23 +113,29 @@ def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displa
         theta = _first_fit(linear_about(legs, theta, parameters), legs, std)
     used = np.ones(len(legs.seconds), dtype=bool)
     state = GaussianState(theta, prior.p)
-    noise = 0.0
     for _ in range(ROBUST_PASSES):
         linear = linear_about(legs, state.x, parameters)
-        left = linear.y - linear.columns @ state.x
-        used = _no_outliers(left[:, :2], legs.stretch)
+        residual = linear.y - linear.columns @ state.x
+        used = _no_outliers(residual[:, :2], legs.stretch)
         if used.sum() < FEWEST_VALUES:
             return None
-        state, noise = _fitted(_means(linear, legs, used, (0, 1)), prior)
+        state = _fitted(_means(linear, legs, used, (0, 1)), prior)
         has_height = used & np.isfinite(legs.variance[:, 2]) & (np.abs(legs.position[:, 2]) < FARTHEST_M)
         if has_height.sum() >= FEWEST_VALUES:
-            state, _ = _fitted(_means(linear, legs, has_height, (2,)), state)
-    # a heading drift with unknown zero makes yaw uncertain; an unknown pitch ε changes the scale by ε²/2
-    span_s, (x, p) = float(np.ptp(legs.seconds)), state
+            state = _fitted(_means(linear, legs, has_height, (2,)), state)
+    _add_unmodelled(state, float(np.ptp(legs.seconds)), parameters)
+    return DisplacementFit(state, used)
+
+
+def _add_unmodelled(state: GaussianState, span_s: float, parameters: Parameters) -> None:
+    """Add two effects to the covariance: an unknown pitch ε changes the scale by ε²/2, a heading drift the yaw.
+
+    The drift's zero is unknown within the duration of the run, span_s.
+    """
+    x, p = state
     _, across, up = parameters.rotation_dvl_from_body.T
     p[SCALE, SCALE] += 0.75 * float(across @ p[:3, :3] @ across) ** 2
     p[:3, :3] += np.outer(up, up) * (x[DRIFT] ** 2 + p[DRIFT, DRIFT]) * span_s**2 / 12.0
-    return DisplacementFit(state, noise, used)
 
 
 def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
@@ -142,18 +148,19 @@ def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displace
 
 
 def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
-    """Linearise fixes minus dead reckoning about θ (13,)."""
+    """Linearise fixes minus dead reckoning about θ (13,): the residual of θ is y - columns @ θ."""
     t = parameters.rotation_dvl_from_body
 
     def matrix(errors: Array) -> Array:
+        """Return C (3, 3), body from measured DVL velocity."""
         return correction_matrix(errors[:3], np.full(3, errors[3]), t)
 
     errors = theta[:N_ERRORS]
     nudges = 1e-5 * np.eye(N_ERRORS)
     slopes = [(matrix(errors + each) - matrix(errors - each)) / 2e-5 for each in nudges]
     columns = np.empty((len(legs.seconds), 3, N_THETA))
-    for place, slope in enumerate(slopes):
-        columns[:, :, place] = np.einsum("nabc,bc->na", legs.way, slope)
+    for state, slope in enumerate(slopes):
+        columns[:, :, state] = np.einsum("nabc,bc->na", legs.way, slope)
     # misalignment about level axes hardly changes horizontal displacements, so it must not gain information from them
     up = t[:, 2]
     columns[:, :2, :3] = (columns[:, :2, :3] @ up)[..., None] * up
@@ -170,19 +177,19 @@ def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
 
 
 def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
-    """Fit θ (13,) by least squares with white noise and Huber weights."""
+    """Fit θ (13,) to the horizontal axes by least squares with white noise and Huber weights. std: (13,) prior σ."""
     _, stretch = np.unique(legs.stretch, return_inverse=True)
     rows = np.concatenate([linear.y[:, :2, None], linear.columns[:, :2]], axis=2)  # (N, 2, 14)
     weight, level = np.ones((len(rows), 2)), 1.0
     theta = np.zeros(N_THETA)
     for _ in range(12):
         centred = rows - _of_stretches(rows, weight, stretch)[stretch]
-        each = centred.reshape(-1, N_THETA + 1)
-        square = (each * weight.reshape(-1, 1)).T @ each
-        theta = np.linalg.solve(square[1:, 1:] + np.diag((level / std) ** 2), square[1:, 0])
-        left = np.abs(centred[..., 0] - centred[..., 1:] @ theta)
-        level = max(float(median(left.ravel())) * 1.4826, 1e-6)
-        weight = np.minimum(1.0, HUBER_Z * level / np.maximum(left, 1e-9))
+        flat = centred.reshape(-1, N_THETA + 1)
+        products = (flat * weight.reshape(-1, 1)).T @ flat  # of y and the columns
+        theta = np.linalg.solve(products[1:, 1:] + np.diag((level / std) ** 2), products[1:, 0])
+        deviation = np.abs(centred[..., 0] - centred[..., 1:] @ theta)
+        level = max(float(median(deviation.ravel())) * 1.4826, 1e-6)  # σ, m
+        weight = np.minimum(1.0, HUBER_Z * level / np.maximum(deviation, 1e-9))
     return theta
 
 
@@ -194,23 +201,23 @@ def _of_stretches(rows: Array, weight: Array, stretch: Index) -> Array:
     return np.asarray(sums / total[..., None])
 
 
-def _no_outliers(left: Array, stretch: Index) -> Mask:
-    """Return which of N fixes are no outliers, from their residuals (N, 2) m."""
-    n = len(left)
-    places = np.clip(np.arange(n)[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, n - 1)
-    near = np.where((stretch[places] == stretch[:, None])[..., None], left[places], np.nan)
-    away = left - np.nanmedian(near, axis=1)
-    near_enough = np.abs(away) < OUTLIER_Z * np.maximum(robust_std(away), 1e-6)
-    centred = left.copy()
-    for each in np.unique(stretch):
-        own = stretch == each
-        centred[own] -= median(left[own])
-    in_reach = np.abs(centred) < LASTING_OUTLIER_Z * np.maximum(robust_std(centred), MIN_NOISE_M)
-    return np.asarray((near_enough & in_reach).all(axis=1))
+def _no_outliers(residual: Array, stretch: Index) -> Mask:
+    """Return which of N fixes are no outliers, from their residuals (N, 2) m and stretches (N,)."""
+    n = len(residual)
+    around = np.clip(np.arange(n)[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, n - 1)
+    neighbours = np.where((stretch[around] == stretch[:, None])[..., None], residual[around], np.nan)
+    from_neighbours = residual - np.nanmedian(neighbours, axis=1)
+    is_near = np.abs(from_neighbours) < OUTLIER_Z * np.maximum(robust_std(from_neighbours), 1e-6)
+    from_stretch = residual.copy()
+    for number in np.unique(stretch):
+        own = stretch == number
+        from_stretch[own] -= median(residual[own])
+    in_reach = np.abs(from_stretch) < LASTING_OUTLIER_Z * np.maximum(robust_std(from_stretch), MIN_NOISE_M)
+    return np.asarray((is_near & in_reach).all(axis=1))
 
 
 def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Blocks:
-    """Average the fixes in use over blocks of time."""
+    """Average the fixes in `use` (N,) over blocks of time, along some axes (0: east, 1: north, 2: up)."""
     at = np.flatnonzero(use)
     seconds = legs.seconds[at]
     length = max(BLOCK_S, float(seconds[-1] - seconds[0]) / MAX_BLOCKS)
@@ -225,34 +232,45 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
     y, columns = mean(linear.y[at][:, axes]), mean(linear.columns[at][:, axes])
     stretch = legs.stretch[at][first]
     # a stretch of one block holds no information, as its constant is free; of very many stretches the longest suffice
-    names, sizes = np.unique(stretch, return_counts=True)
+    numbers, sizes = np.unique(stretch, return_counts=True)
     longest = np.argsort(-sizes, kind="stable")
-    kept = longest[(sizes[longest] > 1) & (np.cumsum(sizes[longest]) <= max(2 * MAX_BLOCKS, int(sizes.max())))]
-    of_use = np.isin(stretch, names[kept])
-    return _Blocks(mean(seconds)[of_use], stretch[of_use], weight[of_use], y[of_use].T, columns[of_use].swapaxes(0, 1))
+    sufficient = np.cumsum(sizes[longest]) <= max(2 * MAX_BLOCKS, int(sizes.max()))
+    kept = np.isin(stretch, numbers[longest[(sizes[longest] > 1) & sufficient]])
+    return _Blocks(mean(seconds)[kept], stretch[kept], weight[kept], y[kept].T, columns[kept].swapaxes(0, 1))
 
 
 def _hypotheses(blocks: _Blocks) -> Array:
     """Return noise covariances (G, B, B) of the hypotheses, relative to the white variance of a fix."""
-    t, white = blocks.seconds, 1.0 / blocks.weight
+    seconds, white = blocks.seconds, 1.0 / blocks.weight
     usual = float(median(white))
-    same = blocks.stretch[:, None] == blocks.stretch
-    starts = np.array([t[blocks.stretch == each][0] for each in blocks.stretch])
-    walk = np.where(same, np.minimum(t[:, None], t) - starts[:, None], 0.0) / WALK_S
-    apart = np.abs(t[:, None] - t)
+    is_same_stretch = blocks.stretch[:, None] == blocks.stretch
+    starts = np.array([seconds[blocks.stretch == each][0] for each in blocks.stretch])
+    walk = np.where(is_same_stretch, np.minimum(seconds[:, None], seconds) - starts[:, None], 0.0) / WALK_S
+    apart = np.abs(seconds[:, None] - seconds)
     lasting = [np.zeros_like(apart)] + [size * np.exp(-apart / tau) for size in LASTING for tau in LASTING_S]
-    each = np.array([one + more * walk for one in lasting for more in WALKED]) * usual + np.diag(white)
-    most = np.diagonal(each, axis1=1, axis2=2).max(axis=1)
-    return np.asarray(each + FREE_VARIANCE * most[:, None, None] * same)
+    each = np.array([process + size * walk for process in lasting for size in WALKED]) * usual + np.diag(white)
+    largest = np.diagonal(each, axis1=1, axis2=2).max(axis=1)
+    return np.asarray(each + FREE_VARIANCE * largest[:, None, None] * is_same_stretch)
 
 
-def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float]:
-    """Return the posterior from the mixture of all hypotheses, and the white noise of a fix, m."""
-    if not len(blocks.seconds):
-        return prior, 0.0
-    covariance = _hypotheses(blocks)
+class _NormalEquations(NamedTuple):
+    """Sums of squares and products over all blocks and axes, for G noise covariances and a white variance of 1.
+
+    square: (G,) of y. vector: (G, 13) of y and the columns. information: (G, 13, 13) of the columns. log_det: (G,) log
+    determinant of the noise covariance of all axes. freedom: degrees of freedom.
+    """
+
+    square: Array
+    vector: Array
+    information: Array
+    log_det: Array
+    freedom: float
+
+
+def _normal_equations(blocks: _Blocks) -> _NormalEquations:
+    """Whiten the blocks by each noise hypothesis, and sum their products."""
     axes, n, _ = blocks.columns.shape
-    root = np.linalg.cholesky(covariance)
+    root = np.linalg.cholesky(_hypotheses(blocks))
     log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     rows = np.concatenate([blocks.y[:, :, None], blocks.columns], axis=2)
     rows = rows - rows.mean(axis=1, keepdims=True)  # a common constant has no effect, as each stretch has a free one
@@ -260,41 +278,64 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     whitened = np.linalg.solve(root, np.concatenate(list(rows), axis=1)[None])  # NumPy 1 takes (B, k) for vectors
     parts = np.split(whitened, axes, axis=2)
     square = np.asarray(sum(part.swapaxes(1, 2) @ part for part in parts))
-    yy, by, told = square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:]
     freedom = float(axes * (n - len(np.unique(blocks.stretch))))
-    # hypotheses of the heading deviation, combined with those of the noise: (G, F, ...)
-    wider = np.ones((len(DEVIATES), N_THETA))
-    wider[:, DEVIATION] = DEVIATES[:, None]
-    known = np.linalg.inv(prior.p * wider[:, :, None] * wider[:, None, :])
-    level = np.maximum(yy / max(freedom, 1.0), MIN_NOISE_M**2)[:, None] * np.ones(len(DEVIATES))
+    return _NormalEquations(square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:], axes * log_det, freedom)
+
+
+class _Hypothesised(NamedTuple):
+    """Posteriors for G noise hypotheses and F sizes of the heading deviation.
+
+    x (G, F, 13), p (G, F, 13, 13), log_evidence (G, F). freedom: (G, F) that determine the white variance of a fix.
+    """
+
+    x: Array
+    p: Array
+    freedom: Array
+    log_evidence: Array
+
+
+def _posteriors(sums: _NormalEquations, prior: GaussianState) -> _Hypothesised:
+    """Return the posterior of θ under each pair of hypotheses, by iterating on the white variance (m²) of a fix."""
+    sizes = np.ones((len(DEVIATES), N_THETA))
+    sizes[:, DEVIATION] = DEVIATES[:, None]
+    known = np.linalg.inv(prior.p * sizes[:, :, None] * sizes[:, None, :])
+    variance = np.maximum(sums.square / max(sums.freedom, 1.0), MIN_NOISE_M**2)[:, None] * np.ones(len(DEVIATES))
     for _ in range(6):
-        information = known + told[:, None] / level[..., None, None]
-        vector = (known @ prior.x) + by[:, None] / level[..., None]
+        from_data = sums.information[:, None] / variance[..., None, None]
+        information = known + from_data
+        vector = (known @ prior.x) + sums.vector[:, None] / variance[..., None]
         x = np.linalg.solve(information, vector[..., None])[..., 0]
-        left = yy[:, None] - 2.0 * (x * by[:, None]).sum(axis=-1) + np.einsum("gfi,gij,gfj->gf", x, told, x)
-        spent = np.trace(np.linalg.solve(information, told[:, None] / level[..., None, None]), axis1=2, axis2=3)
-        level = np.maximum(left / np.maximum(freedom - spent, 1.0), MIN_NOISE_M**2)
-    information = known + told[:, None] / level[..., None, None]
-    p = np.linalg.inv(information)
-    away = x - prior.x
-    misfit = left / level + np.einsum("gfi,fij,gfj->gf", away, known, away)
-    likely = -0.5 * (
-        misfit
-        + freedom * np.log(level)
-        + axes * log_det[:, None]
+        residual_square = sums.square[:, None] - 2.0 * (x * sums.vector[:, None]).sum(axis=-1)
+        residual_square = residual_square + np.einsum("gfi,gij,gfj->gf", x, sums.information, x)
+        n_estimated = np.trace(np.linalg.solve(information, from_data), axis1=2, axis2=3)
+        variance = np.maximum(residual_square / np.maximum(sums.freedom - n_estimated, 1.0), MIN_NOISE_M**2)
+    information = known + sums.information[:, None] / variance[..., None, None]
+    from_prior = x - prior.x
+    log_evidence = -0.5 * (
+        residual_square / variance
+        + np.einsum("gfi,fij,gfj->gf", from_prior, known, from_prior)
+        + sums.freedom * np.log(variance)
+        + sums.log_det[:, None]
         + np.linalg.slogdet(information)[1]
         - np.linalg.slogdet(known)[1]
     )
-    likely = likely + _DEVIATES_LOG
-    share = np.exp(likely - likely.max())
-    share /= share.sum()
-    mean = np.einsum("gf,gfi->i", share, x)
-    apart = x - mean
-    # Student's t, as few degrees of freedom determine the level
-    few = np.maximum(freedom - spent, 3.0)
-    p = p * (few / (few - 2.0))[..., None, None]
-    total = np.einsum("gf,gfij->ij", share, p) + np.einsum("gf,gfi,gfj->ij", share, apart, apart)
-    return GaussianState(mean, 0.5 * (total + total.T)), float(np.sqrt((share * level).sum()))
+    freedom = np.maximum(sums.freedom - n_estimated, 3.0)
+    return _Hypothesised(x, np.linalg.inv(information), freedom, log_evidence + _DEVIATES_LOG)
+
+
+def _fitted(blocks: _Blocks, prior: GaussianState) -> GaussianState:
+    """Return the posterior from the mixture of all hypotheses."""
+    if not len(blocks.seconds):
+        return prior
+    each = _posteriors(_normal_equations(blocks), prior)
+    weight = np.exp(each.log_evidence - each.log_evidence.max())
+    weight /= weight.sum()
+    mean = np.einsum("gf,gfi->i", weight, each.x)
+    apart = each.x - mean
+    # variance of Student's t, as few degrees of freedom determine the white variance
+    p = each.p * (each.freedom / (each.freedom - 2.0))[..., None, None]
+    total = np.einsum("gf,gfij->ij", weight, p) + np.einsum("gf,gfi,gfj->ij", weight, apart, apart)
+    return GaussianState(mean, 0.5 * (total + total.T))
 
 
 # Largest distance of a vehicle from its start, m.
@@ -442,8 +483,7 @@ class DeadReckoning:
         n = len(seconds)
         way = rotation[:, :, :, None] * velocity[:, None, None, :]
         east, north, _ = (rotation @ (velocity @ self._body_from_dvl.T)[..., None])[..., 0].T
-        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-        terms = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), seconds])
+        terms = np.column_stack([heading_cycles(rotation), seconds])
         turned = np.column_stack([-north, east, np.zeros(n)])
         return np.concatenate(
             [way.reshape(n, 27), (turned[:, :, None] * terms[:, None, :]).reshape(n, 3 * N_HEADING)], axis=1

@@ -21,7 +21,7 @@ from ..assessment.model_selection import NO_EVIDENCE, Evidence
 from ..checks.beam_faults import BeamFault
 from ..filters.cross_validation import HeldOutError, Moments, held_out_error
 from ..filters.filter_bank import Group, ModelCounts
-from ..filters.state_history import Counts, Numbers, StateTrace
+from ..filters.state_history import Numbers, PastStates, StateTrace
 from ..models import Model
 from ..models.parameters import ParameterError, Parameters
 from ..models.plugins import load
@@ -46,7 +46,7 @@ class EstimatorSetup:
     initial: initial state of the model. on_evidence: called when a result takes effect, with the stamp of the first DVL
     sample that it may affect. verified: keep what hold-out verification needs. worker: runs slow work in order, in
     one thread, so that live messages do not wait; None runs it immediately. together: number of blocks gathered before
-    they are solved, unless a result is requested. registration: of clocks and frames, if already computed.
+    they are solved, unless a result is requested.
     """
 
     model: Model
@@ -57,7 +57,6 @@ class EstimatorSetup:
     verified: bool
     worker: Executor | None
     together: int
-    registration: Registration | None = None
 
 
 class Estimator(ABC):
@@ -192,8 +191,11 @@ class Estimator(ABC):
         return self.state().p
 
     @abstractmethod
-    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
-        """Return x (E, n), P (E, n, n), samples used and sums of νᵀS⁻¹ν (E,) after E rows of a trace."""
+    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> PastStates:
+        """Return the states after E rows of a trace.
+
+        trace: history of the linear filters. numbers, stamps_ns: (E,) of the rows.
+        """
 
     @abstractmethod
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
@@ -245,11 +247,29 @@ class Estimator(ABC):
         return ()
 
 
+class Remembered(NamedTuple):
+    """State of an estimator from a stamp on. used, nis_sum: samples used until then, and their Σ νᵀS⁻¹ν."""
+
+    from_ns: int
+    state: GaussianState
+    used: int
+    nis_sum: float
+
+
+def states_in_effect(remembered: Sequence[Remembered], stamps_ns: Stamps) -> PastStates:
+    """Return the states in effect at stamps (E,). remembered: in order; the first one is from the beginning on."""
+    at = np.searchsorted([each.from_ns for each in remembered], stamps_ns, side="right") - 1
+    in_effect = [remembered[index] for index in at.tolist()]
+    x, p = np.array([each.state.x for each in in_effect]), np.array([each.state.p for each in in_effect])
+    used = np.array([each.used for each in in_effect], dtype=np.int64)
+    return PastStates(GaussianState(x, p), used, np.array([each.nis_sum for each in in_effect]))
+
+
 class LinearEstimator(Estimator):
     """A model in a group of linear filters."""
 
     def __init__(self, model: Model, group: Group, update: Callable[[Group], None]) -> None:
-        """Wrap a model of a group. update: gives the group the rows that it has not had."""
+        """Wrap a model of a group. update: gives the group the rows since its last update."""
         self._model, self._group, self._update = model, group, update
 
     def state(self) -> GaussianState:
@@ -267,12 +287,9 @@ class LinearEstimator(Estimator):
         self._update(self._group)
         return self._group.of_recording(self._model.name)
 
-    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
+    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> PastStates:
         """See `Estimator`."""
-        snapshot = trace.snapshot(self._group, numbers)
-        name = self._model.name
-        used, nis_sum = self._group.counts_at(name, snapshot)
-        return self._group.states_at(name, snapshot), used, nis_sum
+        return self._group.states_at(self._model.name, trace.snapshot(self._group, numbers))
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
         """See `Estimator`."""

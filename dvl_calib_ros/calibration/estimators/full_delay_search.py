@@ -24,14 +24,14 @@ def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameter
     if len(blocks) > SEARCHED_BLOCKS:
         return delay
     rows = [_dvl_at_delays(joined, parameters) for _, joined in joined_blocks(blocks)]
-    squares = _left_by_delay(rows) if rows else None
+    squares = _residual_squares(rows) if rows else None
     if squares is None:
         return delay
     best = int(np.argmin(squares))
-    now = float(np.interp(delay, DELAYS_S, squares))
+    at_current = float(np.interp(delay, DELAYS_S, squares))
     n = sum(len(each.body) for each in rows)
-    is_clear = n * math.log(now / squares[best]) > MIN_CHI2_GAIN * CORRELATED_ROWS
-    return float(DELAYS_S[best]) if is_clear and abs(DELAYS_S[best] - delay) > STEP_S else delay
+    is_significant = n * math.log(at_current / squares[best]) > MIN_CHI2_GAIN * CORRELATED_ROWS
+    return float(DELAYS_S[best]) if is_significant and abs(DELAYS_S[best] - delay) > STEP_S else delay
 
 
 class _DvlAtDelays(NamedTuple):
@@ -45,28 +45,27 @@ class _DvlAtDelays(NamedTuple):
 def _dvl_at_delays(joined: JoinedBlocks, parameters: Parameters) -> _DvlAtDelays:
     """Return the comparable references of blocks with the DVL at every delay."""
     reference = joined.reference
-    rotation, oriented, rates, _, turning_known = joined.attitude_at(reference.times, parameters.imu_timeout)
+    imu = joined.attitude_at(reference.times, parameters.imu_timeout)
     velocity, seen = joined.dvl_at(reference.times + DELAYS_S[:, None])
-    known = seen.all(axis=0) & (oriented | reference.in_body)
-    known &= turning_known & joined.measured[:, :2].all(axis=1)
-    onto = np.where(reference.in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
+    known = seen.all(axis=0) & (imu.oriented | reference.in_body)
+    known &= imu.rates_known & joined.measured[:, :2].all(axis=1)
+    onto = np.where(reference.in_body[:, None, None], np.eye(3), imu.rotation.swapaxes(1, 2))
     body = product(onto, np.where(joined.measured, reference.velocity, 0.0))
-    return _DvlAtDelays(body[known], velocity[:, known], rates[known])
+    return _DvlAtDelays(body[known], velocity[:, known], imu.rates[known])
 
 
-def _left_by_delay(each: Sequence[_DvlAtDelays]) -> Array | None:
+def _residual_squares(parts: Sequence[_DvlAtDelays]) -> Array | None:
     """Return the squared residuals (K,) of a linear fit of forward and port velocity; None for too few rows.
 
     Velocity and rates of three axes have free coefficients, which include mounting, scale and lever arm.
     """
-    body = np.concatenate([own.body for own in each])[:, :2]
+    body = np.concatenate([part.body for part in parts])[:, :2]
     if len(body) < MIN_ROWS:
         return None
-    velocity = np.concatenate([own.velocity for own in each], axis=1)
-    rates = np.concatenate([own.rates for own in each])
-    h = np.concatenate([velocity, np.broadcast_to(rates, velocity.shape)], axis=2)
-    across = h.swapaxes(1, 2)
-    known = across @ h + 1e-9 * np.eye(6)
-    side = across @ body
-    squares: Array = (body**2).sum() - (side * np.linalg.solve(known, side)).sum(axis=(1, 2))
+    velocity = np.concatenate([part.velocity for part in parts], axis=1)
+    rates = np.concatenate([part.rates for part in parts])
+    design = np.concatenate([velocity, np.broadcast_to(rates, velocity.shape)], axis=2)  # (K, J, 6)
+    information = design.swapaxes(1, 2) @ design + 1e-9 * np.eye(6)
+    vector = design.swapaxes(1, 2) @ body
+    squares: Array = (body**2).sum() - (vector * np.linalg.solve(information, vector)).sum(axis=(1, 2))
     return np.maximum(squares, 1e-12)

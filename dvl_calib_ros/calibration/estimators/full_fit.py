@@ -100,6 +100,25 @@ class _Day:
     level_std: Array = field(default_factory=lambda: np.full(3, math.inf))
 
 
+class _PriorPoints(NamedTuple):
+    """Points of the slow errors' prior: slow errors (C, 6), and scales of the heading deviation (C,).
+
+    log_weight: (C,) log importance weights.
+    """
+
+    slow: SlowErrors
+    deviation: Array
+    log_weight: Array
+
+
+class _PriorInformation(NamedTuple):
+    """Information of the prior (C, n, n), its product with the state (C, n), and -log determinant (C,)."""
+
+    information: Array
+    vector: Array
+    log_det: Array
+
+
 class _Climb(NamedTuple):
     """Mean velocity upwards of a day by its DVL.
 
@@ -136,30 +155,27 @@ class JointEstimate(NamedTuple):
 class JointFit:
     """Joint fit of blocks in order of time, one day after the other. used: number of references used."""
 
-    def __init__(
-        self, parameters: Parameters, prior: GaussianState, unknown: GaussianState, priors: Priors | None = None
-    ) -> None:
+    def __init__(self, parameters: Parameters, prior: GaussianState, unknown: GaussianState) -> None:
         """Start from priors.
 
         prior: x (20,), P (20, 20) of the states on the first day. unknown: prior of the per-day states on further days.
         """
         self._parameters, self._prior, self._unknown = parameters, prior, unknown
-        self._priors = priors or Priors()
         self._arm_is_given = any(parameters.lever_arm)
         self._days = [_Day()]
         self._x = prior.x.copy()  # vehicle and days
         self._linear = self._x.copy()  # the point of linearisation
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
-        self._slow, self._deviation, self._log_prior = self._points()
+        self._points = self._points_about_centre()
         self._known: dict[tuple[int | None, int | None, bool, int], _Hypotheses] = {}
         self.used = self.gated = 0
         self._misfit = 0.0
         self._fitted: JointEstimate | None = None
         self._without: tuple[JointEstimate | None, list[list[GaussianState]]] | None = None
 
-    def _points(self) -> tuple[SlowErrors, Array, Array]:
-        """Return slow errors (C, 6), scales of heading deviation (C,) and log importance weights (C,) of the points."""
-        p = self._priors
+    def _points_about_centre(self) -> _PriorPoints:
+        """Return the points of the prior, shifted by `_centre`."""
+        p = Priors()
         levels = p.horizontal, p.vertical, p.heading, p.memory, p.deviation
         median, factor = np.array(levels).T
         at = _UNIT_POINTS + self._centre
@@ -167,25 +183,25 @@ class JointFit:
         tilt = np.full_like(heading, p.tilt)
         std = np.stack([horizontal, horizontal, vertical, tilt, tilt, heading], axis=1)
         slow = SlowErrors(std, np.repeat(memory[:, None], std.shape[1], axis=1))
-        return slow, deviation, 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1))
+        return _PriorPoints(slow, deviation, 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1)))
 
     def _recentre(self) -> None:
         """Move the prior points to the data's estimate of the slow errors, and add up all sections again."""
         assert self._fitted is not None
-        if any(day.before is not None for day in self._days):
+        if any(day.before is not None for day in self._days):  # blocks without streams are summed at these points
             return
         for _ in range(MAX_RECENTRED):
             moved = self._fitted.weights @ _UNIT_POINTS
             if np.abs(moved).max() < RECENTRED_FROM:
                 return
             self._centre = self._centre + moved
-            self._slow, self._deviation, self._log_prior = self._points()
+            self._points = self._points_about_centre()
             self._known.clear()
             for day in self._days:
                 if day.sections:
-                    day.chain = Chain.begun(self._slow)
+                    day.chain = Chain.begun(self._points.slow)
                     for section in day.sections:
-                        day.chain = day.chain.after(section.gram, section.seconds, self._slow)
+                        day.chain = day.chain.after(section.gram, section.seconds, self._points.slow)
             self._solve()
 
     # ------------------------------------------------------------------ blocks
@@ -253,10 +269,12 @@ class JointFit:
         """Slow errors as estimated, the mean of their posterior; None before the first block."""
         if self._fitted is None or not self.has_data:
             return None
-        horizontal, *_, heading = np.sqrt(self._fitted.weights @ self._slow.std**2).tolist()
-        return SlowNoise(horizontal, heading, float(self._fitted.weights @ self._slow.memory_s[:, 0]))
+        weights, slow = self._fitted.weights, self._points.slow
+        horizontal, *_, heading = np.sqrt(weights @ slow.std**2).tolist()
+        return SlowNoise(horizontal, heading, float(weights @ slow.memory_s[:, 0]))
 
     def _by_day(self, state: GaussianState) -> list[GaussianState]:
+        """Return the states (20,) of each day from a state of [vehicle, each day]."""
         days = map(self._of_day, range(len(self._days)))
         return [with_bias_in_mounting(state.x[at], state.p[np.ix_(at, at)]) for at in days]
 
@@ -267,6 +285,7 @@ class JointFit:
         return at
 
     def _is_far(self) -> bool:
+        """Return whether the estimate has moved away from the point of linearisation."""
         assert self._fitted is not None
         moved = np.abs(self._x - self._linear) > RELINEARISED_FROM * np.sqrt(np.diag(self._fitted.state.p))
         return any(moved[self._of_day(number)][LINEARISED].any() for number in range(len(self._days)))
@@ -299,14 +318,14 @@ class JointFit:
             while n > KEPT_BLOCKS and day.blocks:
                 block = day.blocks.pop(0)
                 n -= 1
-                before = day.before or [Chain.begun(self._slow)] * (1 + FOLDS)
+                slow = self._points.slow
+                before = [*(day.before or [Chain.begun(slow)] * (1 + FOLDS))]
                 while day.sections and day.begin_s < block.end_s - 1e-6:
                     section = day.sections.pop(0)
                     day.begin_s += section.seconds
-                    before = [
-                        each.after(None if fold == section.fold else section.gram, section.seconds, self._slow)
-                        for fold, each in enumerate(before, start=-1)
-                    ]
+                    for index, chain in enumerate(before):  # with all folds, then without each
+                        gram = None if index - 1 == section.fold else section.gram
+                        before[index] = chain.after(gram, section.seconds, slow)
                 day.before = before
 
     def _linearise(self) -> None:
@@ -351,7 +370,7 @@ class JointFit:
         """Add sections to their day's chain. x: (20,) point of linearisation."""
         for part in parts:
             if day.chain is None:
-                day.chain = Chain.begun(self._slow)
+                day.chain = Chain.begun(self._points.slow)
                 day.begin_s = day.end_s = part.from_s
             if part.from_s > day.end_s + 1e-6:
                 self._append(day, _Section(part.from_s - day.end_s, None, -1))
@@ -373,12 +392,13 @@ class JointFit:
         """Append a section to the chain of its day."""
         assert day.chain is not None
         day.sections.append(section)
-        day.chain = day.chain.after(section.gram, section.seconds, self._slow)
+        day.chain = day.chain.after(section.gram, section.seconds, self._points.slow)
         day.end_s += section.seconds
 
     # ------------------------------------------------------------------ solution
 
     def _solve(self) -> None:
+        """Solve for the states of all days from their chains."""
         ended = [None if day.chain is None else day.chain.ended() for day in self._days]
         self._fitted = self._mixture(ended, slice(None), self._climbs())
         self._x = self._fitted.state.x.copy()
@@ -393,22 +413,28 @@ class JointFit:
     def without_folds(self) -> list[list[GaussianState]]:
         """Return, per fold, the states (20,) of every day from all other folds, computed once per estimate."""
         if self._without is None or self._without[0] is not self._fitted:
-            points, folds = self._likeliest, np.arange(FOLDS)
-            slow = SlowErrors(*(np.repeat(each[points], FOLDS, axis=0) for each in self._slow))
-            ended: list[Eliminated | None] = []
-            for day in self._days:
-                chain = Chain.begun(slow)
-                if day.before is not None:
-                    each = (chain_of.part(points) for chain_of in day.before[1:])
-                    chain = Chain(*map(np.concatenate, zip(*each, strict=True)))
-                for section in day.sections:
-                    gram = None if section.gram is None else section.gram * (folds != section.fold)[:, None, None]
-                    chain = chain.after(gram, section.seconds, slow)
-                ended.append(None if day.chain is None else chain.ended())
-            own = [[each and Eliminated(*(x[f : f + 1] for x in each)) for each in ended] for f in range(FOLDS)]
-            found = [self._mixture(each, points, self._climbs(fold)) for fold, each in enumerate(own)]
-            self._without = self._fitted, [self._by_day(each.state) for each in found]
+            ended, states = [self._ended_without_folds(day) for day in self._days], []
+            for fold in range(FOLDS):
+                without = [each and each.part(slice(fold, fold + 1)) for each in ended]
+                found = self._mixture(without, self._likeliest, self._climbs(fold))
+                states.append(self._by_day(found.state))
+            self._without = self._fitted, states
         return self._without[1]
+
+    def _ended_without_folds(self, day: _Day) -> Eliminated | None:
+        """Return the information of a day without each fold, as FOLDS points; None for a day without sections."""
+        if day.chain is None:
+            return None
+        likeliest, folds = self._points.slow.part(self._likeliest), np.arange(FOLDS)
+        slow = SlowErrors(*(np.repeat(each, FOLDS, axis=0) for each in likeliest))
+        chain = Chain.begun(slow)
+        if day.before is not None:
+            older = [each.part(self._likeliest) for each in day.before[1:]]
+            chain = Chain(*map(np.concatenate, zip(*older, strict=True)))
+        for section in day.sections:
+            gram = None if section.gram is None else section.gram * (folds != section.fold)[:, None, None]
+            chain = chain.after(gram, section.seconds, slow)
+        return chain.ended()
 
     def held_out_error(self) -> HeldOutError | None:
         """Return the velocity error on references, each by states fitted without its fold; None if too few.
@@ -418,7 +444,7 @@ class JointFit:
         """
         if not self.has_data:
             return None
-        slow = self._slow.part(self._likeliest)
+        slow = self._points.slow.part(self._likeliest)
         slow_variance, memory_s = slow.std[0] ** 2, float(slow.memory_s[0, 0])
         sums, seconds = HeldOutSums(), 0.0
         for day in self._days:
@@ -443,8 +469,8 @@ class JointFit:
         if not self.has_data:
             return None
         points, k = self._likeliest, N_EFFECTS
-        own, of_state, _ = self._by_prior(points, math.inf, 0.0)
-        n = len(of_state[0]) + k
+        prior = self._prior_information(points, math.inf, 0.0)
+        n = len(prior.vector[0]) + k
         blocks, velocity, effects = TimeBlocks(), [], np.arange(n - k, n)
         for number, day in enumerate(self._days):
             if not np.isfinite(day.white).all():
@@ -454,14 +480,15 @@ class JointFit:
             for part in self._parts(day.blocks, x):
                 if part.rows is None:
                     continue
-                gram = effects_gram(part, effect_velocities, x, day.single, day.white, self._slow.part(points))
+                gram = effects_gram(part, effect_velocities, x, day.single, day.white, self._points.slow.part(points))
                 information, vector = np.zeros((1, n, n)), np.zeros((1, n))
                 information[0][np.ix_(at, at)], vector[0, at] = gram[:-1, :-1], gram[:-1, -1]
                 blocks.add(information, vector, 1.0)
                 velocity.append(part.rows.dvl)
         if not velocity:
             return None
-        return most_significant(blocks, own[0], of_state[0], np.concatenate(velocity).mean(axis=0))
+        mean_velocity = np.concatenate(velocity).mean(axis=0)
+        return most_significant(blocks, prior.information[0], prior.vector[0], mean_velocity)
 
     def _climbs(self, without: int = -1) -> list[_Climb]:
         """Return the mean climb of every day that shows one. without: fold that is held out."""
@@ -477,20 +504,23 @@ class JointFit:
         return found
 
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice, climbs: Sequence[_Climb]) -> JointEstimate:
-        """Return mean and covariance over points of the slow errors and over the hypotheses of the priors."""
+        """Return mean and covariance over points of the slow errors and over the hypotheses of the priors.
+
+        ended: information of each day without slow errors. climbs: measured as zero, within their σ.
+        """
         known = self._hypotheses(points, bool(climbs))
         information, vector = known.information.copy(), known.vector.copy()
-        left = known.log_det.copy()
-        for number, each in enumerate(ended):
-            if each is not None:
+        deviance = known.log_det.copy()  # -2 log evidence
+        for number, day in enumerate(ended):
+            if day is not None:
                 at = self._of_day(number)
-                information[:, :, at[:, None], at] += each.gram[:, :N_STATE, :N_STATE]
-                vector[:, :, at] += each.gram[:, :N_STATE, N_STATE]
-                left += each.gram[:, N_STATE, N_STATE] + each.log_determinant
+                information[:, :, at[:, None], at] += day.gram[:, :N_STATE, :N_STATE]
+                vector[:, :, at] += day.gram[:, :N_STATE, N_STATE]
+                deviance += day.gram[:, N_STATE, N_STATE] + day.log_determinant
         covariance = covariance_of(information, known.information)
         x = product(covariance, vector)
-        left += np.linalg.slogdet(information)[1] - (x * vector).sum(axis=-1)
-        # a mean climb of zero is a measurement, with a variance by path
+        deviance += np.linalg.slogdet(information)[1] - (x * vector).sum(axis=-1)
+        # Kalman update by the climbs
         h = np.zeros((len(climbs), x.shape[-1]))
         for row, climb in zip(h, climbs, strict=True):
             row[climb.at] = climb.row[:-1]
@@ -500,9 +530,9 @@ class JointFit:
         innovation = (h @ along)[:, None] + (std[:, None, :, None] ** 2 * np.eye(len(h)))
         inverse = np.linalg.inv(innovation)
         by_climb = product(inverse, climbing[:, None])
-        left = left[:, None] + (climbing[:, None] * by_climb).sum(axis=-1) + np.linalg.slogdet(innovation)[1]
+        by_path = deviance[:, None] + (climbing[:, None] * by_climb).sum(axis=-1) + np.linalg.slogdet(innovation)[1]
         x = x[:, None] - product(along[:, None], by_climb)
-        evidence = known.log_odds[:, :, None] + self._log_prior[points] - 0.5 * left
+        evidence = known.log_odds[:, :, None] + self._points.log_weight[points] - 0.5 * by_path
         weights = np.exp(evidence - evidence.max())
         weights /= weights.sum()
         mean = np.tensordot(weights, x, 3)
@@ -525,28 +555,28 @@ class JointFit:
             climbs = {TRIM_STD_MPS: P_EXCEPTION, DIVE_STD_MPS: P_EXCEPTION} if seen_climbing else {}
             paths = {0.0: 1.0 - sum(climbs.values()), **climbs}
             cases = list(itertools.product(arms, offsets))
-            priors = [self._by_prior(points, arm, offset) for arm, offset in cases]
+            priors = [self._prior_information(points, arm, offset) for arm, offset in cases]
             information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
-            odds = np.log([[arms[arm] * offsets[offset] * path for path in paths.values()] for arm, offset in cases])
-            self._known[key] = _Hypotheses(information, vector, log_det, odds, np.array([*paths]))
+            of_cases = np.array([arms[arm] * offsets[offset] for arm, offset in cases])
+            log_odds = np.log(of_cases[:, None] * np.array([*paths.values()]))
+            self._known[key] = _Hypotheses(information, vector, log_det, log_odds, np.array([*paths]))
         return self._known[key]
 
-    def _by_prior(self, points: slice, tape_std: float, offset_std: float) -> tuple[Array, Array, Array]:
-        """Return the prior's information (C, n, n), its product with the state (C, n) and -log determinant (C,).
+    def _prior_information(self, points: slice, tape_std: float, offset_std: float) -> _PriorInformation:
+        """Return the information of the prior of [vehicle, each day].
 
         tape_std: σ (m) of a configured lever arm; inf for `initial_std_lever_arm`. offset_std: σ (m/s) of the vertical
         reference error; 0 for `reference_offset_std`.
         """
-        deviation = self._deviation[points]
+        deviation = self._points.deviation[points]
         n = len(OF_VEHICLE) + len(OF_DAY) * len(self._days)
         information, vector = np.zeros((len(deviation), n, n)), np.zeros((len(deviation), n))
         for number in range(len(self._days)):
             at = self._of_day(number)
-            known = self._prior if number == 0 else self._unknown
-            own, of_state = known.information
-            places = OF_DAY if number else np.arange(N_STATE)
-            information[:, at[places][:, None], at[places]] += own[np.ix_(places, places)]
-            vector[:, at[places]] += of_state[places]
+            day_information, day_vector = (self._prior if number == 0 else self._unknown).information
+            new = OF_DAY if number else np.arange(N_STATE)  # the first day also holds the states of the vehicle
+            information[:, at[new][:, None], at[new]] += day_information[np.ix_(new, new)]
+            vector[:, at[new]] += day_vector[new]
         scale = np.ones((len(deviation), n))
         scale[:, HEADING] = 1.0 / deviation[:, None]
         if offset_std:
@@ -555,4 +585,4 @@ class JointFit:
         if self._arm_is_given:
             scale[:, LEVER_ARM] = np.maximum(np.sqrt(np.diag(self._prior.p)[LEVER_ARM]) / tape_std, 1.0)
         information *= scale[:, :, None] * scale[:, None]
-        return information, vector * scale, -2.0 * np.log(scale).sum(axis=1)
+        return _PriorInformation(information, vector * scale, -2.0 * np.log(scale).sum(axis=1))

@@ -32,7 +32,7 @@ from ..models.parameters import Parameters
 from ..numerics.frames import Array, cross, rotation_from_quaternion, skew, squared, turned_skew
 from ..numerics.kalman import GaussianState
 from ..numerics.robust import MEDIAN_SQUARE
-from ..numerics.samples import Mask
+from ..numerics.samples import Index, Mask
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
 # Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad).
@@ -122,10 +122,10 @@ class PredictedRows(NamedTuple):
 
     def parts(self, bounds: Sequence[int]) -> list[PredictedRows | None]:
         """Return the rows between each two bounds; None for no rows."""
-        return [
-            PredictedRows._make(column[first:last] for column in self) if last > first else None
-            for first, last in pairwise(bounds)
-        ]
+        parts: list[PredictedRows | None] = []
+        for first, last in pairwise(bounds):
+            parts.append(PredictedRows._make(column[first:last] for column in self) if last > first else None)
+        return parts
 
 
 def spline_slopes(times: Array, values: Array) -> Array:
@@ -151,6 +151,24 @@ def spline_slopes(times: Array, values: Array) -> Array:
     right[1:-1] = 3.0 * (step[1:, None] * rise[:-1] + step[:-1, None] * rise[1:])
     right[0], right[-1] = first, last
     return np.linalg.solve(matrix, right)
+
+
+class AttitudeAt(NamedTuple):
+    """Attitude ``rotation_enu_from_body`` (J, 3, 3), identity without one, and turn rates at J times.
+
+    oriented: (J,) where the attitude is known. rates: (J, 3) rad/s, and their derivative `turning` (J, 3) rad/s², body
+    axes; rates_known: (J,).
+    """
+
+    rotation: Array
+    oriented: Mask
+    rates: Array
+    turning: Array
+    rates_known: Mask
+
+    def part(self, at: Index) -> AttitudeAt:
+        """Return the rows of some indices."""
+        return AttitudeAt._make(column[at] for column in self)
 
 
 class JoinedBlocks:
@@ -179,10 +197,10 @@ class JoinedBlocks:
         spline = _Spline(self, [block.dvl.times for block in self.blocks], times, gap_s)
         return spline.of([(block.dvl.velocity, block.slope) for block in self.blocks]), spline.known
 
-    def attitude_at(self, times: Array, gap_s: float) -> tuple[Array, Mask, Array, Array, Mask]:
-        """Interpolate ``rotation_enu_from_body`` (J, 3, 3), known (J,), rates and accelerations (J, 3), known (J,).
+    def attitude_at(self, times: Array, gap_s: float) -> AttitudeAt:
+        """Interpolate attitude and turn rates at times (J,) s, across gaps of up to gap_s.
 
-        times: (J,) s. A straight line between attitudes at 1 Hz is wrong by a degree at the start of a turn.
+        A straight line between attitudes at 1 Hz is wrong by a degree at the start of a turn.
         """
         around = times + np.array([[0.0], [-TURNING_S], [TURNING_S]])
         spline = _Spline(self, [block.imu.times for block in self.blocks], around, gap_s)
@@ -195,7 +213,7 @@ class JoinedBlocks:
         has = self.by_row([not np.isnan(block.imu.orientation).any() for block in self.blocks])
         rotation[~has] = np.eye(3)
         known = spline.known[0]
-        return rotation, known & has, rates, (after - before) / (2.0 * TURNING_S), known
+        return AttitudeAt(rotation, known & has, rates, (after - before) / (2.0 * TURNING_S), known)
 
 
 class _Spline:
@@ -246,61 +264,95 @@ def joined_blocks(blocks: Sequence[FitBlock]) -> Iterator[tuple[list[int], Joine
         yield numbers, JoinedBlocks([blocks[number] for number in numbers])
 
 
-def _predicted(joined: JoinedBlocks, x: Array, parameters: Parameters) -> list[PredictedRows | None]:
-    """Return the rows of each of the joined blocks, see `predicted`."""
+class _AtReferences(NamedTuple):
+    """Streams at the delayed times of the J usable references of joined blocks.
+
+    used: (J,) their indices. turns: (J, 1) 0 for a reference in body axes, else 1. velocity, earlier, later: (J, 3) m/s
+    of the DVL, its frame, then, and `reach` (J,) s before and after.
+    """
+
+    used: Index
+    turns: Array
+    imu: AttitudeAt
+    velocity: Array
+    earlier: Array
+    later: Array
+    reach: Array
+
+
+def _at_references(joined: JoinedBlocks, x: Array, parameters: Parameters) -> _AtReferences:
+    """Interpolate the streams at delays of a state x (20,), and select the usable references."""
     reference = joined.reference
     at = reference.times - x[REFERENCE_DELAY]
-    rotation, oriented, rates, turning, turning_known = joined.attitude_at(at, parameters.imu_timeout)
+    imu = joined.attitude_at(at, parameters.imu_timeout)
     reach, stamps = joined.by_row([block.slope_reach_s for block in joined.blocks]), at + x[DELAY]
     velocity, known = joined.dvl_at(np.stack([stamps, stamps - reach, stamps + reach]))
-    use = known[0] & (oriented | reference.in_body) & turning_known
+    use = known[0] & (imu.oriented | reference.in_body) & imu.rates_known
     # by the DVL, which is less noisy: selected by the reference, samples near the limit would bias the scale
     use &= squared(velocity[0]) >= parameters.min_speed**2
     if parameters.max_turn_rate > 0.0:
-        use &= squared(rates) <= parameters.max_turn_rate**2
+        use &= squared(imu.rates) <= parameters.max_turn_rate**2
     used = np.flatnonzero(use)
-    bounds = np.searchsorted(used, [0, *(rows.stop for rows in joined.rows)]).tolist()
-    if not len(used):
-        return [None] * len(joined.blocks)
-    rotation, rates, turning, in_body = rotation[used], rates[used], turning[used], reference.in_body[used]
+    turns = np.where(reference.in_body[used, None], 0.0, 1.0)
+    now, earlier, later = velocity[:, used]
+    return _AtReferences(used, turns, imu.part(used), now, earlier, later, reach[used])
+
+
+def _velocity_in_body(streams: _AtReferences, x: Array, parameters: Parameters) -> tuple[Array, Array]:
+    """Return the velocity (J, 3) m/s of the reference point by the DVL, body frame, and its derivatives (J, 3, 20).
+
+    x: (20,) states that correct it, and by which it is differentiated.
+    """
     t = parameters.rotation_dvl_from_body
     inverse = np.linalg.inv(np.eye(3) + skew(x[PHI]))
     gain = 1.0 / (1.0 + np.append(x[SCALE], 0.0))
     arm = np.array(parameters.lever_arm) + x[LEVER_ARM]
-    own_velocity, earlier, later = velocity[:, used]
-    scaled = (own_velocity - x[BIAS]) * gain
+    scaled = (streams.velocity - x[BIAS]) * gain
     in_dvl = scaled @ inverse.T
     through = t.T @ inverse * gain
-    accelerating = (later - earlier) / (2.0 * reach[used, None]) @ through.T
+    acceleration = (streams.later - streams.earlier) / (2.0 * streams.reach[:, None]) @ through.T
+    rates = streams.imu.rates
     body = in_dvl @ t - cross(rates, arm)
-    n = len(used)
-    own = np.zeros((n, 3, N_STATE))
-    own[:, :, PHI] = turned_skew(t.T @ inverse, in_dvl.T).transpose(2, 0, 1)
-    own[:, :, SCALE] = -(t.T @ inverse)[None, :, :2] * (scaled * gain)[:, None, :2]
-    own[:, :, LEVER_ARM] = -skew(rates)
-    own[:, :, BIAS] = -through
-    own[:, :, DELAY] = accelerating
-    turn = np.where(in_body[:, None], 0.0, 1.0)
-    own[:, :, REFERENCE_DELAY] = cross(turning, arm) - accelerating - turn * cross(rates, body)
-    upwards = rotation[:, 2] * oriented[used, None]
-    up = np.column_stack([np.einsum("ni,nik->nk", upwards, own), (upwards * body).sum(axis=1)])
-    cycles = heading_cycles(rotation)
-    off = np.where(in_body, 0.0, cycles @ x[HEADING])
-    onto = np.where(in_body[:, None, None], np.eye(3), _about_up(off) @ rotation)
-    predicted_velocity = np.matmul(onto, body[..., None])[..., 0]
-    columns = onto @ own
-    across = np.stack([-predicted_velocity[:, 1], predicted_velocity[:, 0], np.zeros(n)], axis=1) * turn
+    columns = np.zeros((len(body), 3, N_STATE))
+    columns[:, :, PHI] = turned_skew(t.T @ inverse, in_dvl.T).transpose(2, 0, 1)
+    columns[:, :, SCALE] = -(t.T @ inverse)[None, :, :2] * (scaled * gain)[:, None, :2]
+    columns[:, :, LEVER_ARM] = -skew(rates)
+    columns[:, :, BIAS] = -through
+    columns[:, :, DELAY] = acceleration
+    of_rotation = streams.turns * cross(rates, body)  # the attitude of another time rotates the reference
+    columns[:, :, REFERENCE_DELAY] = cross(streams.imu.turning, arm) - acceleration - of_rotation
+    return body, columns
+
+
+def _predicted(joined: JoinedBlocks, x: Array, parameters: Parameters) -> list[PredictedRows | None]:
+    """Return the rows of each of the joined blocks, see `predicted`."""
+    streams = _at_references(joined, x, parameters)
+    used, turns, rotation = streams.used, streams.turns, streams.imu.rotation
+    if not len(used):
+        return [None] * len(joined.blocks)
+    body, body_columns = _velocity_in_body(streams, x, parameters)
+    upwards = rotation[:, 2] * streams.imu.oriented[:, None]
+    up_columns = np.einsum("ni,nik->nk", upwards, body_columns)
+    up = np.column_stack([up_columns, (upwards * body).sum(axis=1)])
+    # to the frame of the reference, with the heading deviation
+    in_body, cycles = joined.reference.in_body[used], heading_cycles(rotation)
+    deviation = np.where(in_body, 0.0, cycles @ x[HEADING])
+    onto = np.where(in_body[:, None, None], np.eye(3), _about_up(deviation) @ rotation)
+    velocity = np.matmul(onto, body[..., None])[..., 0]
+    columns = onto @ body_columns
+    across = np.stack([-velocity[:, 1], velocity[:, 0], np.zeros(len(used))], axis=1) * turns
     columns[:, :, HEADING] = across[:, :, None] * cycles[:, None, :]
-    columns[:, :, REFERENCE_ERROR] = turn[:, :, None] * np.eye(3)
-    slow = np.zeros((n, 3, SLOW))
+    columns[:, :, REFERENCE_ERROR] = turns[:, :, None] * np.eye(3)
+    slow = np.zeros((len(used), 3, SLOW))
     slow[:, :, :3] = np.eye(3)
-    slow[:, :, 3:] = -turn[:, :, None] * skew(predicted_velocity)
-    residual = reference.velocity[used] - predicted_velocity - turn * x[REFERENCE_ERROR]
-    fold = np.concatenate([block.fold for block in joined.blocks])[used]
-    weight = joined.measured[used].astype(float)
-    beside = 0.5 * (earlier + later)
-    rows = PredictedRows(reference.times[used], residual, columns, slow, weight, fold, up, oriented[used], beside)
-    return rows.parts(bounds)
+    slow[:, :, 3:] = -turns[:, :, None] * skew(velocity)
+    rows = PredictedRows(
+        times=joined.reference.times[used],
+        residual=joined.reference.velocity[used] - velocity - turns * x[REFERENCE_ERROR], columns=columns, slow=slow,
+        weight=joined.measured[used].astype(float), fold=np.concatenate([block.fold for block in joined.blocks])[used],
+        up=up, oriented=streams.imu.oriented, dvl=0.5 * (streams.earlier + streams.later),
+    )  # fmt: skip
+    return rows.parts(np.searchsorted(used, [0, *(own.stop for own in joined.rows)]).tolist())
 
 
 def _about_up(angle: Array) -> Array:

@@ -120,12 +120,10 @@ class _Registered:
         alike = in_body == (2 * np.count_nonzero(in_body) > len(in_body))
         x, y, z = (2 * np.count_nonzero(is_measured[alike], axis=0) > np.count_nonzero(alike)).tolist()
         return make_motion(
-            (dvl[0].copy(), dvl[1].copy()),
-            (times[alike], velocity[alike]),
-            not bool(in_body[alike].all()) if alike.any() else False,
-            (x, y, z),
+            (dvl[0].copy(), dvl[1].copy()), (times[alike], velocity[alike]),
+            not bool(in_body[alike].all()) if alike.any() else False, (x, y, z),
             ImuColumns(*(column.copy() for column in imu)),
-        )
+        )  # fmt: skip
 
     def _columns(self) -> tuple[list[Any], ...]:
         return tuple(
@@ -152,9 +150,9 @@ class Looked(NamedTuple):
 class KeptClocks:
     """Registration results of earlier days and of the current one."""
 
-    def __init__(self, parameters: Parameters, live: bool, known: Registration | None = None) -> None:
-        """Start without blocks. live: the run may last hours. known: registration already computed, not repeated."""
-        self._parameters, self._is_live, self._known = parameters, live, known
+    def __init__(self, parameters: Parameters, live: bool) -> None:
+        """Start without blocks. live: the run may last hours."""
+        self._parameters, self._is_live = parameters, live
         self._seen = _Registered()
         if live:
             self._seen.take_room()
@@ -197,10 +195,10 @@ class KeptClocks:
         return None if looked.registration is None else looked.registration.contradiction(self._parameters)
 
     def _look(self, fit_so_far: FitSoFar | None) -> Looked:
-        """Register the kept blocks, unless registration is known."""
-        motion = self._seen.motion() if self._known is None and len(self._seen) >= MIN_BLOCKS else None
+        """Register the kept blocks."""
+        motion = self._seen.motion() if len(self._seen) >= MIN_BLOCKS else None
         if motion is None:
-            return Looked(self._blocks, self._known)
+            return Looked(self._blocks)
         nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)
         declared = FRAMES[int(self._declared.argmax())]
         try:
@@ -214,23 +212,15 @@ class KeptClocks:
     def _residuals(self, fit_so_far: FitSoFar) -> Residuals:
         """Return the residuals of all kept blocks, each corrected by the fit without its fold."""
         recording, p = self._seen.recording(), self._parameters
-        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + fit_so_far.epoch_ns
-        without = [[states[-1]] for states in fit_so_far.fit.without_folds()]
-        state = fit_so_far.fit.states[-1]
-        terms = [Terms.of_state(state.x) for [state] in without]
+        fit, epoch_ns = fit_so_far
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
+        state = fit.states[-1]
+        terms = [Terms.of_state(states_of_days[-1].x) for states_of_days in fit.without_folds()]
+        instrument_errors = deviation_of(state), fit.slow_noise, fit.beam_fault()
         return Residuals(
-            fit_so_far.fit.held_out_error(),
-            typical_error(recording, Terms.of_state(state.x), p),
-            recording.judged(p),
-            dead_reckoned(
-                recording,
-                folds_of(stamps_ns, p),
-                terms,
-                p,
-                fit_so_far.epoch_ns,
-                deviation_of(state),
-                fit_so_far.fit.slow_noise,
-                fit_so_far.fit.beam_fault(),
-            ),
-            not recording.reference.in_body.any(),
+            held_out=fit.held_out_error(),
+            typical=typical_error(recording, Terms.of_state(state.x), p),
+            judged=recording.judged(p),
+            navigation=dead_reckoned(recording, folds_of(stamps_ns, p), terms, p, epoch_ns, *instrument_errors),
+            in_earth=not recording.reference.in_body.any(),
         )

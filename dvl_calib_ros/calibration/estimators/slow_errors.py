@@ -157,6 +157,10 @@ class Eliminated(NamedTuple):
     gram: Array
     log_determinant: Array
 
+    def part(self, points: slice) -> Eliminated:
+        """Return some of the points."""
+        return Eliminated(self.gram[points], self.log_determinant[points])
+
 
 class Chain(NamedTuple):
     """Chain of sections up to a knot: Gram matrix (C, 27, 27) over [slow errors there, states, residual]."""

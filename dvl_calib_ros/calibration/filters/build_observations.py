@@ -47,17 +47,11 @@ class Observer:
         if needs is not Needs.REFERENCE:
             attitude = None if needs is Needs.NOTHING else np.where(block.oriented[:, None], block.attitude, _UNKNOWN)
             return Observations(
-                block.velocity_dvl,
-                None,
-                lever,
-                *mounting_and_prior,
-                self._unaided_noise,
+                block.velocity_dvl, None, lever, *mounting_and_prior, self._unaided_noise,
                 None if attitude is None else rotation_from_quaternion(attitude[:, :4]),
-                None if attitude is None else attitude[:, 4:],
-                interval,
-                assumptions=self._assumptions,
+                None if attitude is None else attitude[:, 4:], interval, assumptions=self._assumptions,
                 oriented=None if attitude is None else block.oriented,
-            )
+            )  # fmt: skip
         rotation, earth = _reference_in_body(block)
         reference = block.reference[:, :3]
         unmeasured = None

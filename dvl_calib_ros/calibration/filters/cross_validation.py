@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,16 +145,30 @@ def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np
     return GaussianState(x, p)
 
 
-class Moments(FoldSums):
+class MomentSums(NamedTuple):
     """Sums over samples with a reference that suffice to judge any correction.
 
-    Per fold: the number of samples; for each body axis, over samples whose reference measures it, Σ v vᵀ (3, 3, 3) and
-    Σ g vᵀ (3, 3); over all axes, Σ g² and Σ of the variance of R. v (3,) m/s is measured, DVL frame, at the reference
-    point; g m/s is the reference velocity along the axis.
+    samples: their number. vv (3, 3, 3), gv (3, 3): for each body axis, over samples whose reference measures it, Σ v vᵀ
+    and Σ g vᵀ. gg, noise: over all axes, Σ g² and Σ of the variance of R. v (3,) m/s is measured, DVL frame, at the
+    reference point; g m/s is the reference velocity along the axis.
     """
+
+    samples: Array | float
+    vv: Array
+    gv: Array
+    gg: Array | float
+    noise: Array | float
+
+
+class Moments(FoldSums):
+    """`MomentSums` per fold."""
 
     def __init__(self) -> None:
         super().__init__((), (3, 3, 3), (3, 3), (), ())
+
+    def in_fold(self, fold: int | None) -> MomentSums:
+        """Return the sums of one fold, or of all, read-only."""
+        return MomentSums(*(self.total if fold is None else self.of(fold)))
 
     def take(self, folds: NDArray[np.int64], observations: Observations) -> None:
         """Add N samples."""
@@ -178,9 +193,8 @@ class Moments(FoldSums):
 
     def squared_error(self, fold: int, body_from_measured: Array) -> float:
         """Return Σ |g - C v|² (m/s)² over a fold along the measured axes, C (3, 3)."""
-        c = body_from_measured
-        _, vv, gv, gg, _ = self.of(fold)
-        return float(gg - 2.0 * np.sum(c * gv) + np.einsum("ai,aij,aj->", c, vv, c))
+        c, sums = body_from_measured, self.in_fold(fold)
+        return float(sums.gg - 2.0 * np.sum(c * sums.gv) + np.einsum("ai,aij,aj->", c, sums.vv, c))
 
 
 @dataclass(frozen=True)
@@ -212,8 +226,8 @@ def held_out_error(
 
     without: one state for each fold.
     """
-    samples = int(moments.total[0])
-    if samples < FEWEST_SAMPLES or max(moments.of(fold)[0] for fold in range(FOLDS)) == samples:
+    samples = int(moments.in_fold(None).samples)
+    if samples < FEWEST_SAMPLES or max(moments.in_fold(fold).samples for fold in range(FOLDS)) == samples:
         return None
     nominal = rotation_dvl_from_body.T
     uncorrected = corrected = noise = calibration = 0.0
@@ -222,9 +236,9 @@ def held_out_error(
         covariance = model.error_terms_from_state @ state.p @ model.error_terms_from_state.T
         uncorrected += moments.squared_error(fold, nominal)
         corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
-        _, vv, _, _, fold_noise = moments.of(fold)
-        noise += float(fold_noise)
-        calibration += _calibration_variance(covariance, vv, nominal)
+        sums = moments.in_fold(fold)
+        noise += float(sums.noise)
+        calibration += _calibration_variance(covariance, sums.vv, nominal)
     return held_out_from_sums(samples, (uncorrected, corrected, noise + calibration, calibration))
 
 

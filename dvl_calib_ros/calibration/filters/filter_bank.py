@@ -24,7 +24,7 @@ from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Mask, Stamps
 from .cross_validation import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .filter_setup import Assembler
-from .state_history import Counts, Snapshot
+from .state_history import PastStates, Snapshot
 
 # Memory of the integral, s: a pitch error of 3 degrees adds 10 m at 2 m/s, which looks like a constant current.
 MEMORY_S = 100.0
@@ -257,15 +257,11 @@ class Group:
             self._of_recording[name] = self.state(name).raised(self._scatter.inflation(self.index[name]))
         return self._of_recording[name]
 
-    def counts_at(self, name: str, snapshot: Snapshot) -> tuple[Counts, Array]:
-        """Return the samples used by one model (E,) and the sum of νᵀS⁻¹ν over them (E,)."""
+    def states_at(self, name: str, snapshot: Snapshot) -> PastStates:
+        """Return the states of one model after the E rows of a snapshot."""
         index = self.index[name]
-        return snapshot.used[:, index], snapshot.nis_sum[:, index]
-
-    def states_at(self, name: str, snapshot: Snapshot) -> GaussianState:
-        """Return states x (E, n) and covariances P (E, n, n) of one model."""
-        index = self.index[name]
-        return self._assembler.state(index, snapshot.x[:, index], snapshot.p[:, index])
+        state = self._assembler.state(index, snapshot.x[:, index], snapshot.p[:, index])
+        return PastStates(state, snapshot.used[:, index], snapshot.nis_sum[:, index])
 
     def states_without_folds(self, name: str) -> list[GaussianState]:
         """Return state and covariance of one model without each fold."""
@@ -284,12 +280,9 @@ class Group:
         used = int(self._used[index])
         model = self._assembler.models[index]
         return ModelCounts(
-            used,
-            int(self._gated[index]),
-            float(self._nis_sum[index] / used) if used else float("nan"),
-            float(self._rows_sum[index] / used) if used else float(model.n_measurement),
-            int(self._restarted[index]),
-        )
+            used, int(self._gated[index]), float(self._nis_sum[index] / used) if used else float("nan"),
+            float(self._rows_sum[index] / used) if used else float(model.n_measurement), int(self._restarted[index]),
+        )  # fmt: skip
 
 
 def _joined_ends(cuts: Ends, ends: Ends | None) -> Ends | None:
@@ -346,10 +339,9 @@ class BlockScatter:
 
     def add(self, x: Array, p: Array) -> None:
         """Add the states at the cuts, x (E, K, n), P (E, K, n, n)."""
-        for information in _informations(x, p):
-            if information is not None:
-                self._blocks.add(information[0] - self._information[0], information[1] - self._information[1], 1.0)
-                self._information = information
+        for matrix, vector in _informations(x, p):
+            self._blocks.add(matrix - self._information[0], vector - self._information[1], 1.0)
+            self._information = matrix, vector
         self._state = GaussianState(x[-1], p[-1])
         self._found.clear()
 
@@ -370,15 +362,13 @@ class BlockScatter:
         return self._found[index]
 
 
-def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array] | None]:
-    """Yield the information of E states x (K, n), P (K, n, n); None for singular ones, which are skipped."""
+def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array]]:
+    """Yield Λ (K, n, n) and Λx (K, n) of E states x (K, n), P (K, n, n), without singular ones."""
     try:
         yield from zip(*GaussianState(x, p).information, strict=True)
         return
     except np.linalg.LinAlgError:
-        pass
+        pass  # one is singular: invert each alone
     for each in zip(x, p, strict=True):
-        try:
+        with suppress(np.linalg.LinAlgError):
             yield GaussianState(*each).information
-        except np.linalg.LinAlgError:
-            yield None

@@ -82,9 +82,9 @@ class Assembler:
     def _drop_unmeasured(
         self, z: Array, h: Array, noise: Array, observations: Observations, unmeasured: Unmeasured
     ) -> tuple[Array, Array]:
-        """Rotate z and H to the frame of the reference and remove unmeasured rows.
+        """Rotate z and H, in place, to the frame of the reference, and remove unmeasured rows.
 
-        Return R (K, N, 3, 3) and gate (K, N).
+        Return R (K, N, 3, 3) and gate (K, N). A removed row is zero, with variance 1.
         """
         k, n_samples = z.shape[:2]
         noise = np.broadcast_to(noise, (k, n_samples, 3, 3)).copy()
@@ -146,11 +146,12 @@ def gate_of(rows: float, parameters: Parameters) -> float:
     return chi2_isf(gated, rows) if 0.0 < gated < 1.0 else float("inf")  # after rounding
 
 
-def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:
-    """Return two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter. rows: mean per sample.
+def nis_bounds(rows: float, parameters: Parameters, used: int) -> tuple[float, float]:
+    """Return two-sided 99 % bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter.
 
-    The mean excludes gated samples, so it is that of a chi-square variable truncated at the gate: E[qʲ | q <= g] = m
-    (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal. Zero if references measured no axis.
+    rows: mean per sample. The mean excludes gated samples, so it is that of a chi-square variable truncated at the
+    gate: E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal. Zero if
+    references measured no axis.
     """
     if rows <= 0.0:
         return 0.0, 0.0
@@ -158,5 +159,5 @@ def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float
     inside = chi2_cdf(gate, m)
     mean = m * chi2_cdf(gate, m + 2) / inside
     variance = m * (m + 2) * chi2_cdf(gate, m + 4) / inside - mean**2
-    half = math.sqrt(chi2_isf(1.0 - confidence, 1.0) * variance / max(used, 1))  # normal quantile
+    half = math.sqrt(chi2_isf(1.0 - 0.99, 1.0) * variance / max(used, 1))  # normal quantile
     return mean - half, mean + half

@@ -9,11 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
 
 Numbers = NDArray[np.int64]
-
-
 Counts = NDArray[np.int64]
+
+
+class PastStates(NamedTuple):
+    """One model after each of E rows: x (E, n), P (E, n, n). used, nis_sum: (E,) samples used, and their Σ νᵀS⁻¹ν."""
+
+    state: GaussianState
+    used: Counts
+    nis_sum: Array
 
 
 class Snapshot(NamedTuple):

@@ -110,17 +110,9 @@ class Parameters:
         choices=(AUTO, IAC, *MODELS),
         read_only=False,
     )
-    gnss_model: str = _parameter(
-        "M3",
-        "Model of iac with GNSS (IAC-G).",
-        choices=("M3", "M4"),
-        read_only=False,
-    )
+    gnss_model: str = _parameter("M3", "Model of iac with GNSS (IAC-G).", choices=("M3", "M4"), read_only=False)
     gnss_free_model: str = _parameter(
-        "M7",
-        "Model of iac without GNSS (IAC-GF).",
-        choices=("M5", "M6", "M7"),
-        read_only=False,
+        "M7", "Model of iac without GNSS (IAC-GF).", choices=("M5", "M6", "M7"), read_only=False
     )
     gnss_timeout: float = _parameter(
         2.0,
@@ -150,21 +142,16 @@ class Parameters:
     )
     base_frame: str = _parameter("base_link", "Name of the body frame.")
     base_axes: str = _parameter(
-        FLU,
-        "Axes of base_frame and all results: forward-left-up (REP-103) or forward-right-down.",
-        choices=(FLU, FRD),
+        FLU, "Axes of base_frame and all results: forward-left-up (REP-103) or forward-right-down.", choices=(FLU, FRD)
     )
     use_transforms: bool = _parameter(
-        True,
-        "Take default mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description.",
+        True, "Take default mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description."
     )
     publish_tf: bool = _parameter(
-        False,
-        "Broadcast ~/mounting as a static transform (needs tf2_ros). Not next to another publisher of it.",
+        False, "Broadcast ~/mounting as a static transform (needs tf2_ros). Not next to another publisher of it."
     )
     dvl_frame: str = _parameter(
-        "",
-        "frame_id that DVL messages must carry. Empty: the first one that is neither body nor earth.",
+        "", "frame_id that DVL messages must carry. Empty: the first one that is neither body nor earth."
     )
     dvl_axes: str = _parameter(
         FROM_MESSAGE,
@@ -178,8 +165,7 @@ class Parameters:
         "also variance, stamp, frame.",
     )
     gnss_type: str = _parameter(
-        "geometry_msgs/msg/TwistWithCovarianceStamped",
-        "Message type of the reference's topic, live.",
+        "geometry_msgs/msg/TwistWithCovarianceStamped", "Message type of the reference's topic, live."
     )
     position_window: float = _parameter(
         1.0,
@@ -232,10 +218,7 @@ class Parameters:
     )
     restamp: str = _parameter("", "Topics whose stamps are replaced by recording times, with commas between; log: all.")
     dvl_time_offset: float = _parameter(
-        0.0,
-        "Delay of DVL stamps (positive: late), corrected before pairing.",
-        unit="s",
-        within=(-60.0, 60.0),
+        0.0, "Delay of DVL stamps (positive: late), corrected before pairing.", unit="s", within=(-60.0, 60.0)
     )
     reference_time_offset: float = _parameter(
         0.0, "As dvl_time_offset, for the reference.", unit="s", within=(-60.0, 60.0)
@@ -254,16 +237,10 @@ class Parameters:
         within=(-0.01, 0.01),
     )
     dvl_time_jump: float = _parameter(
-        0.0,
-        "Additional delay of DVL stamps from dvl_time_jump_at on. Corrected.",
-        unit="s",
-        within=(-10.0, 10.0),
+        0.0, "Additional delay of DVL stamps from dvl_time_jump_at on. Corrected.", unit="s", within=(-10.0, 10.0)
     )
     dvl_time_jump_at: float = _parameter(
-        0.0,
-        "DVL stamp (s since 1970) at which dvl_time_jump begins.",
-        unit="s",
-        within=(0.0, 2.0**31),
+        0.0, "DVL stamp (s since 1970) at which dvl_time_jump begins.", unit="s", within=(0.0, 2.0**31)
     )
     initial_std_misalignment: float = _parameter(
         0.05, "Prior σ of each misalignment angle.", unit="rad", within=(1e-6, 1.0)
@@ -284,10 +261,7 @@ class Parameters:
     process_std_scale: float = _parameter(0.0, "Random walk of the scale error.", unit="1/√s", within=(0.0, 0.1))
     use_message_covariance: bool = _parameter(True, "R of the GNSS models from message covariances.")
     gnss_aided_std: float = _parameter(
-        0.2,
-        "σ per axis of R of the GNSS models, if the reference has no covariance.",
-        unit="m/s",
-        within=(1e-4, 10.0),
+        0.2, "σ per axis of R of the GNSS models, if the reference has no covariance.", unit="m/s", within=(1e-4, 10.0)
     )
     gnss_free_std: float = _parameter(
         0.025,
@@ -326,10 +300,7 @@ class Parameters:
         within=(0.0, 0.5),
     )
     dvl_bias_std: float = _parameter(
-        0.008,
-        "Prior σ of the DVL's velocity bias per axis (full). 0: no bias.",
-        unit="m/s",
-        within=(0.0, 1.0),
+        0.008, "Prior σ of the DVL's velocity bias per axis (full). 0: no bias.", unit="m/s", within=(0.0, 1.0)
     )
     day_std_heading: float = _parameter(
         math.radians(0.1),
@@ -357,22 +328,14 @@ class Parameters:
     )
     prior_window: float = _parameter(2.0, "Window that prior_source averages.", unit="s", within=(0.1, 600.0))
     prior_sway_heave: tuple[float, ...] = _parameter(
-        (0.0, 0.0),
-        "Sway and heave of prior_source fixed, body frame.",
-        unit="m/s",
-        within=(-10.0, 10.0),
+        (0.0, 0.0), "Sway and heave of prior_source fixed, body frame.", unit="m/s", within=(-10.0, 10.0)
     )
     gate_probability: float = _parameter(
-        0.999,
-        "Share of good samples that pass the gate (chi-square). 0 or 1: off.",
-        within=(0.0, 1.0),
+        0.999, "Share of good samples that pass the gate (chi-square). 0 or 1: off.", within=(0.0, 1.0)
     )
     min_speed: float = _parameter(0.3, "Slower samples are not used. 0: off.", unit="m/s", within=(0.0, 10.0))
     max_turn_rate: float = _parameter(
-        0.0,
-        "Samples above it, or without angular velocity, are not used. 0: off.",
-        unit="rad/s",
-        within=(0.0, 10.0),
+        0.0, "Samples above it, or without angular velocity, are not used. 0: off.", unit="rad/s", within=(0.0, 10.0)
     )
     max_repeats: float = _parameter(
         0.0,
@@ -384,16 +347,10 @@ class Parameters:
         10.0, "A DVL or reference velocity above this is invalid.", unit="m/s", within=(0.1, 100.0)
     )
     max_fom: float = _parameter(
-        0.4,
-        "A figure of merit above this is invalid (dvl_msgs/DVL).",
-        unit="m/s",
-        within=(0.0, 100.0),
+        0.4, "A figure of merit above this is invalid (dvl_msgs/DVL).", unit="m/s", within=(0.0, 100.0)
     )
     imu_timeout: float = _parameter(
-        1.5,
-        "Longest gap between two IMU samples that is interpolated.",
-        unit="s",
-        within=(0.01, 60.0),
+        1.5, "Longest gap between two IMU samples that is interpolated.", unit="s", within=(0.01, 60.0)
     )
     max_latency: float = _parameter(
         1.0,
@@ -429,10 +386,7 @@ class Parameters:
         10.0, "Length of the blocks of hold-out verification.", unit="s", within=(0.1, 3600.0)
     )
     accept_misalignment: float = _parameter(
-        math.radians(2.0),
-        "A misalignment above this (2°) is marginal ...",
-        unit="rad",
-        within=(0.0, math.pi),
+        math.radians(2.0), "A misalignment above this (2°) is marginal ...", unit="rad", within=(0.0, math.pi)
     )
     reject_misalignment: float = _parameter(
         math.radians(5.0), "... and from this (5°) on rejected.", unit="rad", within=(0.0, math.pi)

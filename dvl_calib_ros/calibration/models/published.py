@@ -50,11 +50,7 @@ _NOISY_REGRESSOR = "slow, or a noisy receiver: scale too small by"
 
 
 def _aided(
-    name: str,
-    scale_axes: tuple[tuple[str, tuple[int, ...]], ...],
-    heave_is_zero: bool,
-    assumes: str,
-    wrong_when: str,
+    name: str, scale_axes: tuple[tuple[str, tuple[int, ...]], ...], heave_is_zero: bool, assumes: str, wrong_when: str
 ) -> Model:
     """Return a model with a reference velocity: misalignment, and one scale state per entry of scale_axes."""
     return Model(

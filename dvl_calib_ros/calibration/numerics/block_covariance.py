@@ -129,20 +129,14 @@ class BlocksOfOne(NamedTuple):
 
 
 def inflations(
-    blocks: Sequence[BlocksOfOne],
-    x: Array,
-    p: Array,
-    variance: Array | None = None,
-    lasts: float = LASTING_Z,
-    rarely: float | None = RARE,
+    blocks: Sequence[BlocksOfOne], x: Array, p: Array, lasts: float = LASTING_Z, rarely: float | None = RARE
 ) -> Array:
     """Return the σ inflation factors (S, n), at least 1, of estimates x (S, n), P (S, n, n).
 
-    A factor is the largest over single blocks and over blocks joined by two and four. variance: (S, r) of r other
-    quantities, with p (S, r, n) their covariance with the states. lasts, rarely: see `LASTING_Z` and `RARE`; None:
-    without the factor of Student's t, for thresholds above 3 σ.
+    A factor is the largest over single blocks and over blocks joined by two and four. lasts, rarely: see `LASTING_Z`
+    and `RARE`; None: without the factor of Student's t, for thresholds above 3 σ.
     """
-    variance = np.diagonal(p, axis1=1, axis2=2) if variance is None else variance
+    variance = np.diagonal(p, axis1=1, axis2=2)
     factor = np.ones(variance.shape)
     counts = np.array([len(each.vector) for each in blocks])
     for count in sorted(set(counts[counts >= MIN_BLOCKS].tolist())):

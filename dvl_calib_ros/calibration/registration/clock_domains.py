@@ -128,16 +128,9 @@ class StreamClocks:
         reasons = []
         for each in arrival_offset(ahead, parameters):
             time_scale = TIME_SCALES.get(round(abs(each.ahead)))
-            reasons.append(
-                finding(
-                    "CLOCKS_APART",
-                    whose=SPOKEN[each.stream],
-                    seconds=abs(each.ahead),
-                    side=each.side,
-                    other=SPOKEN[each.other],
-                    known=f" ({time_scale})" if time_scale else "",
-                )
-            )
+            known = f" ({time_scale})" if time_scale else ""
+            values = {"seconds": abs(each.ahead), "side": each.side, "other": SPOKEN[each.other], "known": known}
+            reasons.append(finding("CLOCKS_APART", whose=SPOKEN[each.stream], **values))
         return reasons
 
 

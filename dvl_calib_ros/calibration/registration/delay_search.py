@@ -26,8 +26,8 @@ STEP_S, LONG_STEP_S, MAX_SHORT_STEPS, MAX_STEPS = 0.5, 1.0, 500, 7200
 HOLE_S = 2.5
 # Smallest overlap: share of the shorter stream, and seconds.
 MIN_OVERLAP, MIN_OVERLAP_S = 0.4, 20.0
-# Smallest distance of two minima, s.
-SEPARATION_S = 2.0
+# Smallest distance of two minima, s, and most minima that are refined.
+SEPARATION_S, N_CANDIDATES = 2.0, 4
 
 
 class DelayPair(NamedTuple):
@@ -46,7 +46,7 @@ class _Series(NamedTuple):
     squares: Array
 
 
-def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None, n: int = 4) -> list[DelayPair]:
+def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None) -> list[DelayPair]:
     """Return the likeliest delays by misfit, always with the best ones within 3 s.
 
     rotation_body_from_dvl: (3, 3), None if unknown. Without an attitude, or with a body-frame reference, only the
@@ -55,7 +55,7 @@ def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None
     delays, misfit = _misfits(motion, rotation_body_from_dvl)
     by_reference = delays if misfit.shape[0] > 1 else np.zeros(1)
     near = (np.abs(by_reference)[:, None] <= 3.0) & (np.abs(delays) <= 3.0)
-    found = _minima(misfit, by_reference, delays, n)
+    found = _minima(misfit, by_reference, delays, N_CANDIDATES)
     found += _minima(np.where(near, misfit, np.inf), by_reference, delays, 1)
     return sorted(set(found), key=lambda place: place.misfit)
 

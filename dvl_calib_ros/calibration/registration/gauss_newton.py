@@ -253,16 +253,9 @@ class MotionFit:
             return None
         last = self._solved(x, rows, nominal, rotation, in_time)
         return Fitted(
-            x,
-            rotation,
-            level=last.level,
-            rows=len(rows.at),
-            speed=rows.speed,
-            squares=squared(rows.residual),
-            axes=rows.residual.shape[1],
-            at=rows.at,
-            claims=cache(partial(_claimed, rows, last)),
-        )
+            x, rotation, level=last.level, rows=len(rows.at), speed=rows.speed, squares=squared(rows.residual),
+            axes=rows.residual.shape[1], at=rows.at, claims=cache(partial(_claimed, rows, last)),
+        )  # fmt: skip
 
     def costs(self, x: Array, rotation: Array, level: float) -> tuple[Index, Array]:
         """Return compared references (J,) at a state, and the robust chi-square (J,) of each (`Fitted.cost`)."""

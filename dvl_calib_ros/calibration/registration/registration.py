@@ -332,18 +332,10 @@ def _fewest_delayed_clocks(
         apart=Clock(float(x[DELTA]), float(std[DELTA]), likeliest is not _Delayed.NONE and _is_off(best, DELTA)),
         is_turned=fit.is_turned,
         are_known=bool((free.std[[DELTA, RHO] if fit.is_turned else [DELTA]] < KNOWN_STD_S).all()),
-        rotation_body_from_dvl=best.rotation_body_from_dvl,
-        turn_std=std[TURN],
-        lever_arm=lever_arm + x[ARM],
-        lever_arm_std=std[ARM],
-        scale=float(x[SCALE]),
-        scale_std=float(std[SCALE]),
-        residual=best.residual,
-        spread=best.level,
-        speed=best.speed,
-        next_worse=next_worse,
-        **_reference_clock(fit, free, delay_s, rotation),
-    )
+        rotation_body_from_dvl=best.rotation_body_from_dvl, turn_std=std[TURN], lever_arm=lever_arm + x[ARM],
+        lever_arm_std=std[ARM], scale=float(x[SCALE]), scale_std=float(std[SCALE]), residual=best.residual,
+        spread=best.level, speed=best.speed, next_worse=next_worse, **_reference_clock(fit, free, delay_s, rotation),
+    )  # fmt: skip
 
 
 def _reference_clock(fit: MotionFit, free: Fitted, delay_s: float, rotation: Array | None) -> dict[str, Any]:

@@ -58,13 +58,10 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
     body = velocity @ rotation_dvl_from_body
     reference_times, reference = motion.reference_times, motion.reference
     of_speed = lag(
-        _speed(dvl_times, body),
-        dvl_times[0],
-        _speed(reference_times, reference),
-        reference_times[0],
+        _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0],
         covered(reference_times, _steps(reference_times)).astype(float),
         covered(dvl_times, _steps(dvl_times)).astype(float),
-    )
+    )  # fmt: skip
     if of_speed.is_far:
         return UnregistrableClocks("the DVL's", "the reference's", of_speed.delay_s)
     if not motion.in_earth or not motion.has_attitude:

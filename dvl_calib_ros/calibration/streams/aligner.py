@@ -96,9 +96,9 @@ class Events(NamedTuple):
         order = np.argsort(arrival, kind="stable")
         event_of_sample = np.empty(len(order), dtype=np.intp)
         event_of_sample[order] = np.arange(len(order))
-        events_of_stream = np.split(event_of_sample, np.cumsum([len(each) for each in arrivals[:2]]))
+        dvl_at, reference_at, imu_at = np.split(event_of_sample, np.cumsum([len(each) for each in arrivals[:2]]))
         newest_ns = []
-        for events, stamps, newest_before in zip(events_of_stream, stamps_ns, before_ns, strict=True):
+        for events, stamps, newest_before in zip((dvl_at, reference_at, imu_at), stamps_ns, before_ns, strict=True):
             column = np.full(len(order), LONG_AGO_NS if newest_before is None else newest_before, dtype=np.int64)
             column[events] = stamps
             newest_ns.append(np.maximum.accumulate(column))
@@ -107,7 +107,6 @@ class Events(NamedTuple):
         for track_ns in newest_ns[1:]:
             ahead = (track_ns > dvl_ns) & (track_ns <= dvl_ns + max_jump_ns)
             horizon_ns = np.maximum(horizon_ns, np.where(ahead, track_ns, dvl_ns))
-        dvl_at, reference_at, imu_at = events_of_stream
         return Events(arrival[order], dvl_at, reference_at, imu_at, newest_ns[1], newest_ns[2], horizon_ns)
 
 
@@ -123,15 +122,12 @@ def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
     dvl_is_valid = dvl_screen.valid & are_valid_velocities(dvl.values, max_speed)
     reference_is_valid = reference_screen.valid & are_valid_velocities(reference.values, max_speed)
     return ScreenedStreams(
-        streams,
-        dvl=(dvl.refused == 0) & dvl_is_valid & dvl_is_measured,
+        streams, dvl=(dvl.refused == 0) & dvl_is_valid & dvl_is_measured,
         reference=(reference.refused == 0) & reference_is_valid & reference_is_measured,
-        imu=(imu.refused == 0) & imu_is_known,
-        dvl_covariance=dvl_screen.covariance,
+        imu=(imu.refused == 0) & imu_is_known, dvl_covariance=dvl_screen.covariance,
         reference_values=np.concatenate([reference.values, reference_screen.covariance.reshape(-1, 9)], axis=1),
-        reference_unmeasured=reference_screen.unmeasured,
-        imu_values=np.concatenate([orientation, rates], axis=1),
-    )
+        reference_unmeasured=reference_screen.unmeasured, imu_values=np.concatenate([orientation, rates], axis=1),
+    )  # fmt: skip
 
 
 def ordered(

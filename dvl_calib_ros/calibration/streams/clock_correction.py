@@ -35,13 +35,10 @@ class Clocks:
     def of(parameters: Parameters) -> Clocks:
         """Return the delays of the parameters."""
         return Clocks(
-            round(parameters.dvl_time_offset * SECOND_NS),
-            round(parameters.reference_time_offset * SECOND_NS),
-            round(parameters.imu_time_offset * SECOND_NS),
-            parameters.dvl_clock_drift,
-            round(parameters.dvl_time_jump * SECOND_NS),
-            round(parameters.dvl_time_jump_at * SECOND_NS),
-        )
+            round(parameters.dvl_time_offset * SECOND_NS), round(parameters.reference_time_offset * SECOND_NS),
+            round(parameters.imu_time_offset * SECOND_NS), parameters.dvl_clock_drift,
+            round(parameters.dvl_time_jump * SECOND_NS), round(parameters.dvl_time_jump_at * SECOND_NS),
+        )  # fmt: skip
 
     def dvl(self, stamp_ns: S, first_ns: int) -> S:
         """Return the true time (ns) of a DVL stamp, or of stamps (N,). first_ns: first stamp of the run."""
