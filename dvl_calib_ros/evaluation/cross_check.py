@@ -83,14 +83,14 @@ class _Replayed:
     """
 
     parameters: Parameters
-    found: tuple[str, ...]
     corrections: Array
-    moments: RunMoments | None
-    n_paired: int
-    notes: tuple[str, ...]
-    delayed: Mapping[str, Terms]
-    recording: ThinnedRecording | None
-    selected: tuple[str, Terms | None]
+    found: tuple[str, ...] = ()
+    moments: RunMoments | None = None
+    n_paired: int = 0
+    notes: tuple[str, ...] = ()
+    delayed: Mapping[str, Terms] = field(default_factory=dict)
+    recording: ThinnedRecording | None = None
+    selected: tuple[str, Terms | None] = ("-", None)
     dvl: Recorded | None = None
     failed: tuple[str, ...] = ()
 
@@ -189,18 +189,7 @@ def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Giv
         raise
     except Exception as error:
         failed = f"failed, and is in none of the figures: {Failure.of(error, 'replay')}"
-        return _Replayed(
-            parameters,
-            found=(),
-            corrections=np.full((len(models), 3, 3), np.nan),
-            moments=None,
-            n_paired=0,
-            notes=(),
-            delayed={},
-            recording=None,
-            selected=("-", None),
-            failed=(failed,),
-        )
+        return _Replayed(parameters, np.full((len(models), 3, 3), np.nan), failed=(failed,))
 
 
 def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
@@ -245,17 +234,10 @@ def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Pat
     }
     selected = result.selected, _terms(result.estimate) if result.estimate.used else None
     return _Replayed(
-        parameters,
-        found=discovery.found,
-        corrections=corrections,
-        moments=moments,
-        n_paired=n_paired,
-        notes=(*discovery.doubts, *replayed.notes),
-        delayed=delayed,
-        recording=kept[0] if kept else None,
-        selected=selected,
+        parameters, corrections, discovery.found, moments, n_paired, (*discovery.doubts, *replayed.notes), delayed,
+        recording=kept[0] if kept else None, selected=selected,
         dvl=opened.recorded(topics.found_in(opened.types).dvl, parameters),
-    )
+    )  # fmt: skip
 
 
 # states of lever arm and delay

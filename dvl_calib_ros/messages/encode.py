@@ -79,11 +79,11 @@ class SampleWriter:
         """Write a reference velocity as TwistWithCovarianceStamped."""
         self._bag.message(topic, TWIST_TYPE, sample.stamp_ns, self._twist(sample, frame_id))
 
-    def fix(self, topic: str, fix: SatelliteFix, frame_id: str = "gnss") -> None:
+    def fix(self, topic: str, fix: SatelliteFix) -> None:
         """Write a position as NavSatFix, without a covariance."""
         types = self._types
         message = types[FIX_TYPE](
-            header=self._header(fix.stamp_ns, frame_id),
+            header=self._header(fix.stamp_ns, "gnss"),
             status=types["sensor_msgs/msg/NavSatStatus"](0, 1),
             latitude=fix.latitude_deg,
             longitude=fix.longitude_deg,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from ..calibration.assessment.dead_reckoning import Drift
 from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
@@ -341,6 +341,27 @@ def cross_check(check: CrossCheck) -> Document:
     for name, by_model in zip(check.names, check.corrected, strict=True):
         for model, row in zip(check.models, by_model, strict=True):
             errors.append((name, model, *(number(value, 4) for value in row.tolist())))
+    drifts = []
+    as_mounted: dict[str, Any] = {}  # hardly depends on the calibrating bag: the first one's
+    for calibrated, name, model in zip(check.bags, check.names, check.selected, strict=True):
+        navigations = [check.navigation.get((calibrated, verified)) for verified in check.bags]
+        drifts.append((name, model, [None if each is None else each.after for each in navigations]))
+        for verified, navigation in zip(check.bags, navigations, strict=True):
+            if navigation is not None:
+                as_mounted.setdefault(verified, navigation.before)
+    drift_rows = [
+        (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in of_bags))
+        for name, model, of_bags in [("nothing", "as mounted", [*map(as_mounted.get, check.bags)]), *drifts]
+    ]
+    pictures: list[Item] = []
+    for verified, name in zip(check.bags, check.names, strict=True):
+        tracks = {}
+        for calibrated, calibrated_name in zip(check.bags, check.names, strict=True):
+            if (calibrated, verified) in check.navigation:
+                tracks[f"by {calibrated_name}"] = check.navigation[calibrated, verified]
+        if tracks:
+            uncorrected = next(iter(tracks.values()))
+            pictures.append(figures("replay_figures.navigation_pictures", uncorrected, tracks, f", {name}"))
     return Document(
         title="Bags checked against each other",
         subtitle=", ".join(check.names),
@@ -354,8 +375,8 @@ def cross_check(check: CrossCheck) -> Document:
             ),
             section(
                 "Dead reckoning on bags that were not calibrated on",
-                Table(heading, _drift_rows(check) if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
-                *_drift_pictures(check),
+                Table(heading, drift_rows if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
+                *pictures,
             ),
             section(
                 "Difference of DVL and GNSS on bags that were not calibrated on",
@@ -365,35 +386,3 @@ def cross_check(check: CrossCheck) -> Document:
         ],
         parameters=check.parameters,
     )
-
-
-def _drift_rows(check: CrossCheck) -> list[tuple[str, ...]]:
-    """Return rows of calibrating bag, model, and the drift of each verifying bag; the first row without calibration."""
-    rows = []
-    as_mounted: dict[str, Drift] = {}  # hardly depends on the calibrating bag: the first one's
-    for calibrated, name, model in zip(check.bags, check.names, check.selected, strict=True):
-        navigations = [check.navigation.get((calibrated, verified)) for verified in check.bags]
-        rows.append((name, model, *(_drift_text(each.after if each else None) for each in navigations)))
-        for verified, navigation in zip(check.bags, navigations, strict=True):
-            if navigation is not None:
-                as_mounted.setdefault(verified, navigation.before)
-    return [("nothing", "as mounted", *(_drift_text(as_mounted.get(bag)) for bag in check.bags)), *rows]
-
-
-def _drift_text(drift: Drift | None) -> str:
-    return "–" if drift is None else f"{drift.per_km:.1f} ({drift.percent:.2g} %)"
-
-
-def _drift_pictures(check: CrossCheck) -> list[Item]:
-    """Return the map of each verifying bag, with the track by each other bag's calibration."""
-    pictures: list[Item] = []
-    for verified, name in zip(check.bags, check.names, strict=True):
-        tracks = {}
-        for calibrated, calibrated_name in zip(check.bags, check.names, strict=True):
-            navigation = check.navigation.get((calibrated, verified))
-            if navigation is not None:
-                tracks[f"by {calibrated_name}"] = navigation
-        if tracks:
-            uncorrected = next(iter(tracks.values()))  # hardly depends on the calibrating bag
-            pictures.append(figures("replay_figures.navigation_pictures", uncorrected, tracks, f", {name}"))
-    return pictures

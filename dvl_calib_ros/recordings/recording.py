@@ -314,18 +314,13 @@ def _read(
         kept[column.topic], counts[column.topic] = column, len(column)
         types[column.topic], held[column.topic] = IMU_TYPE, Held(frozenset({IMU_TYPE}), False)
     return Recording(
-        paths=(path,),
-        types=types,
-        held=held,
-        counts=counts,
-        file_spans_ns=file_spans_ns,
+        (path,), types, held, counts, file_spans_ns,
         notes=(*bag.notes, *map(str, far_findings)),
         columns={topic: (column,) for topic, column in kept.items()},
-        transforms=tuple(found.transforms),
-        descriptions=tuple(dict.fromkeys(found.descriptions)),
+        transforms=tuple(found.transforms), descriptions=tuple(dict.fromkeys(found.descriptions)),
         waters=tuple(reading for each in found.waters.values() for reading in each.readings()),
         field_maps=_field_maps(bag),
-    )
+    )  # fmt: skip
 
 
 class _Contents:

@@ -44,17 +44,14 @@ class Stretch(NamedTuple):
 
 
 def stretches(
-    columns: Mapping[Stream, Sequence[TopicColumns]],
-    decoder: MessageDecoder,
-    size: int | None = None,
-    share: float = 1.0,
+    columns: Mapping[Stream, Sequence[TopicColumns]], decoder: MessageDecoder, share: float = 1.0
 ) -> Iterator[Stretch]:
-    """Yield all messages of streams, `size` at a time; `SampleBlock.arrival` has their order of log time.
+    """Yield all messages of streams, `STRETCH_MESSAGES` at a time; `SampleBlock.arrival` has their order of log time.
 
     columns: of each stream's topic, one part per recording. share: of them, in `WINDOWS`; the last window ends with the
     recording.
     """
-    at_once = STRETCH_MESSAGES if size is None else size
+    at_once = STRETCH_MESSAGES
     all_parts = [part for parts in columns.values() for part in parts]
     arrival = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *(part.arrivals[0] for part in all_parts)]))
     if share < 1.0:  # samples after a gap are processed individually, which must be a small part of a window

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +17,6 @@ from ..diagnosis.diagnose import diagnose_recordings
 from ..diagnosis.model.recorded_streams import RecordedStreams, load_recordings, zeros_while_moving
 from ..diagnosis.model.stream_curve import Curve
 from ..diagnosis.search.effect_selection import EffectSelection
-from ..effects.base import Effect
-from ..effects.registry import EFFECTS
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
 from ..recordings.recording import Recording as Opened
@@ -142,7 +140,6 @@ class Log:
 def read_log(
     source: RecordedSide,
     on_progress: Callable[[float], None] = lambda _: None,
-    effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> Log:
     """Read and diagnose one side. Raises InputError if it cannot be compared."""
@@ -151,7 +148,7 @@ def read_log(
     on_progress(0.5)
     exact = all(float(np.linalg.norm(each.dvl.roughness)) < NOISE_FREE_MPS for each in loaded.recordings)
     recordings = tuple(dithered(each) for each in loaded.recordings) if exact else loaded.recordings
-    diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, effects, with_series)
+    diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, with_series=with_series)
     on_progress(1.0)
     residuals: tuple[Array, ...] = ()
     if diagnosis.selection is not None:

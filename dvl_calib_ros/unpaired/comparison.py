@@ -22,7 +22,7 @@ from ..diagnosis.diagnose import VISIBLE_TIMES_TYPICAL
 from ..diagnosis.fit.gauss_newton import around
 from ..diagnosis.model.stream_curve import FAST_ENOUGH_S
 from ..diagnosis.search.effect_selection import EffectSelection
-from ..effects.base import Effect, EffectInput
+from ..effects.base import EffectInput
 from ..effects.registry import EFFECTS
 from ..verdict.reasons import Reason, finding
 from .both_sides import Log, RecordedSide, read_log
@@ -326,13 +326,12 @@ def compare(
     vehicle: RecordedSide,
     simulator: RecordedSide,
     on_progress: Callable[[float], None] = lambda _: None,
-    effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> UnpairedComparison:
     """Compare bags of a vehicle with bags of a simulator. Raises InputError if they cannot be compared."""
-    real = read_log(vehicle, lambda share: on_progress(0.4 * share), effects, with_series)
-    simulated = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
-    comparison = compare_logs(real, simulated, effects)
+    real = read_log(vehicle, lambda share: on_progress(0.4 * share), with_series)
+    simulated = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), with_series)
+    comparison = compare_logs(real, simulated)
     on_progress(1.0)
     return replace(comparison, reasons=(*comparison.reasons, *other_frame(vehicle, simulator)))
 
@@ -346,14 +345,14 @@ def other_frame(vehicle: RecordedSide, simulator: RecordedSide) -> tuple[Reason,
     return () if frames[0] == frames[1] else (finding("SIMULATOR_FRAME", vehicle=frames[0], simulator=frames[1]),)
 
 
-def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> UnpairedComparison:
+def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
     """Run `compare` for sides that are already read and diagnosed."""
     selections = vehicle.selection, simulator.selection
     if selections[0] is None or selections[1] is None:
         return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
     candidates = [*compare_noise(vehicle, simulator), *compare_streams(vehicle, simulator)]
     names = common_names(vehicle, simulator)
-    compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names), effects)
+    compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names))
     p = holm([*compared.p.values(), *(each.p for each in candidates)])
     found = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
     found += [compared.untested(name) for name in compared.names if name not in compared.p]
@@ -374,9 +373,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
         levels={name: (level, levels[1][name]) for name, level in levels[0].items() if name in levels[1]},
         rungs=shrunk.rungs,
         floor_mps=shrunk.floor,
-        not_shown={
-            side: _unobserved(log.diagnosis, effects) for side, log in (("vehicle", vehicle), ("simulator", simulator))
-        },
+        not_shown={side: _unobserved(log.diagnosis) for side, log in (("vehicle", vehicle), ("simulator", simulator))},
         vehicle=vehicle.diagnosis,
         simulator=simulator.diagnosis,
         notes=tuple(
@@ -409,9 +406,8 @@ class _Compared:
         selections: tuple[EffectSelection, EffectSelection],
         renamed: tuple[Mapping[str, str], Mapping[str, str]],
         names: Sequence[str],
-        effects: Mapping[str, Effect],
     ) -> None:
-        self.names, self._effects = names, effects
+        self.names = names
         self._selections, self._logs, self._renamed = selections, logs, renamed
         self._fits = tuple(fitted(selection, names) for selection in selections)
         per_side = [
@@ -438,7 +434,7 @@ class _Compared:
             smallest = ", ".join(f"{key} {value:.2g}" for key, value in detectable.items())
             needs = (
                 f"the two logs together would show a difference of {smallest}; with the {blind}: "
-                f"{self._effects[name].manoeuvre}"
+                f"{EFFECTS[name].manoeuvre}"
             )
         side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not is_present[0] else 0
         trace = trace_of(self._selections[side], self._fits[side], self.sizes[name][side].effect)
@@ -451,7 +447,7 @@ class _Compared:
     def untested(self, name: str) -> ComparedEffect:
         """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
         sizes = [side[name].intervals() if name in side else {} for side in self._per_side]
-        effect = self._effects[name]
+        effect = EFFECTS[name]
         needs = f"no common part of it is observable in both logs: {effect.manoeuvre}"
         for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):
             if name not in selection.testable:
@@ -495,12 +491,12 @@ def _noise(candidate: Candidate, p: float) -> ComparedNoise:
     )
 
 
-def _unobserved(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str, str]:
+def _unobserved(diagnosis: Diagnosis) -> dict[str, str]:
     """Return effects unobservable on a side at relevant sizes -> the smallest detectable size, or the missing data."""
     found = {name: f"needs {needs}" for name, needs in diagnosis.untestable.items()}
     named = {each.name for each in diagnosis.effects}
     for name, least in diagnosis.minimum_detectable.items():
-        typical = {spec.name: spec.typical for spec in effects[name].parameters}
+        typical = {spec.name: spec.typical for spec in EFFECTS[name].parameters}
         if name not in named and not any(size <= VISIBLE_TIMES_TYPICAL * typical[key] for key, size in least.items()):
             found[name] = "from " + ", ".join(f"{key} {size:.2g}" for key, size in least.items())
     return found

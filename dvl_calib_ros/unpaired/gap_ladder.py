@@ -106,12 +106,12 @@ class Shrunk:
     recording_of: NDArray[np.intp]
 
 
-def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed: int = 0) -> Shrunk:
-    """Compare the vehicle's DVL with the velocity that each model of the ladder predicts. seed: of random noise."""
+def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel]) -> Shrunk:
+    """Compare the vehicle's DVL with the velocity that each model of the ladder predicts."""
     selection = vehicle.selection
     if selection is None:
         raise ValueError("nothing was fitted to the vehicle's recordings")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     problem = selection.fitter.problem
     recorded = [each.dvl.values for each in problem.recordings]
     time = np.concatenate([each.dvl.time for each in problem.recordings])

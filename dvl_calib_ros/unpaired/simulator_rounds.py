@@ -21,7 +21,6 @@ from ..calibration.models.parameters import Parameters
 from ..diagnosis.answer.results import Diagnosis, diagnosis_document
 from ..diagnosis.model.hypothesis import amplitudes
 from ..disk.text_files import write_json
-from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..errors import InputError
 from ..recordings.recording import open_recording
@@ -116,7 +115,6 @@ def close_gap(
     rounds: int,
     folder: Path,
     on_progress: Callable[[float], None] = lambda _: None,
-    effects: Mapping[str, Effect] = EFFECTS,
 ) -> ClosedGap:
     """Compare; then repeatedly correct the differences, simulate the simulator's motion and compare again.
 
@@ -129,7 +127,6 @@ def close_gap(
     rounds: Largest number of rounds.
     folder: Folder for simulated bags.
     on_progress: Receives the finished share.
-    effects: By name.
 
     Raises
     ------
@@ -148,20 +145,20 @@ def close_gap(
     def part(number: int) -> Callable[[float], None]:
         return lambda share: on_progress((number + share) / steps)
 
-    real = read_log(vehicle, part(0), effects)
-    as_recorded = compare_logs(real, read_log(simulator, part(1), effects), effects)
+    real = read_log(vehicle, part(0))
+    as_recorded = compare_logs(real, read_log(simulator, part(1)))
     found = [Round(replace(as_recorded, reasons=(*as_recorded.reasons, *other_frame(vehicle, simulator))))]
     document = None if real.diagnosis.dvl is None else diagnosis_document(real.diagnosis)
     while document is not None and found[-1].claims and len(found) <= rounds:
         if len(found) > 1:
-            corrected = corrected_document(document, found[-1].comparison, effects)
+            corrected = corrected_document(document, found[-1].comparison)
             if corrected == document:
                 break
             document = corrected
         simulated = _simulated(document, len(found), simulator, folder, real.diagnosis)
-        log = read_log(simulated, part(1 + len(found)), effects)
+        log = read_log(simulated, part(1 + len(found)))
         log = replace(log, facts=tuple(replace(each, latency=np.zeros(0)) for each in log.facts))  # no real log times
-        found.append(Round(compare_logs(real, log, effects), document))
+        found.append(Round(compare_logs(real, log), document))
     on_progress(1.0)
     return ClosedGap(tuple(found))
 
@@ -200,14 +197,12 @@ def against(
         return close_gap(vehicle, simulator, rounds, Path(folder), on_progress)
 
 
-def corrected_document(
-    document: Mapping[str, Any], comparison: UnpairedComparison, effects: Mapping[str, Effect] = EFFECTS
-) -> dict[str, Any]:
+def corrected_document(document: Mapping[str, Any], comparison: UnpairedComparison) -> dict[str, Any]:
     """Return a DVL's document corrected by the differences in effects, noise and rate."""
     corrected: dict[str, Any] = deepcopy(dict(document))
     by_name = {each["name"]: each for each in corrected["effects"]}
     for compared in (each for each in comparison.effects if each.status.is_claim):
-        effect = effects[compared.name]
+        effect = EFFECTS[compared.name]
         if not is_of_every_run(effect) or any(" of " in key for key in compared.vehicle):
             continue  # differs per recording, or happens at a time of a run that the simulator's may not have
         entry = by_name.get(effect.name)
