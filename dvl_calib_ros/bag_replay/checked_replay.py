@@ -139,11 +139,12 @@ def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reas
     Without a reference nothing else rejects these axes of the DVL or a vehicle that travels astern.
     """
     is_rejected = verification.verdict is Severity.REJECT
-    kept = [
-        each if each.severity is Severity.MARGINAL else each.weighed(Severity.REJECT)
-        for each in contradictions
-        if each.severity is Severity.MARGINAL or each.code in DECISIVE or (is_rejected and is_cause(each))
-    ]
+    kept = []
+    for each in contradictions:
+        if each.severity is Severity.MARGINAL:
+            kept.append(each)
+        elif each.code in DECISIVE or (is_rejected and is_cause(each)):
+            kept.append(each.weighed(Severity.REJECT))
     if any(each.code == "MOUNTING_CONTRADICTED" for each in kept):  # which says it with the option to type
         reasons = (each for each in verification.reasons if "MOUNTING_FITS" not in {one.code for one in each.causes})
         verification = replace(verification, reasons=tuple(reasons))

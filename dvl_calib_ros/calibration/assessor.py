@@ -143,7 +143,7 @@ class Assessor:
         except np.linalg.LinAlgError:
             return None
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
-        # one correction per fold and day
+        # one correction per fold and day, by its index in the flat list
         n_days, p = len(terms[0]), self._estimates.parameters
         parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
         corrections = [each for of_days in terms for each in of_days]

@@ -40,7 +40,7 @@ class Catalogued:
 
     @staticmethod
     def of(recording: str, vehicle: str, rows: Sequence[Row], document: Mapping[str, Any] | None) -> Catalogued:
-        """Build from the plain data of a part."""
+        """Build from a recording's part of the catalogue. document: `Extrinsics` as plain data; None without any."""
         if document is None:
             return Catalogued(recording, vehicle, tuple(rows))
         values = {field.name: document[field.name] for field in fields(Extrinsics) if field.name in document}

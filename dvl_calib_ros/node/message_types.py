@@ -41,7 +41,7 @@ def velocity_class(parameter: str, name: str, dvl_fields: str = "") -> Any:
         read = mapped_type(full, dvl_fields).adapted
         try:
             assert read is not None
-            read(found())
+            read(found())  # an empty message has all fields
         except UNREADABLE as error:
             raise InputError(f"dvl_fields: {dvl_fields!r} does not fit {full}: {error}") from error
         name = full

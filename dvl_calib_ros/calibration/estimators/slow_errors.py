@@ -121,11 +121,10 @@ def scatter(bins: Bins) -> tuple[Array, Array]:
         if n < 4:
             continue
         root = np.sqrt(weight)
-        lines = bins.rows[:, axis][:, [axis, SLOW + axis]] * root[:, None]
+        line = bins.rows[:, axis][:, [axis, SLOW + axis]] * root[:, None]  # from its values at the start and the end
         residual = bins.rows[:, axis, -1] * root
-        known = lines.T @ lines + 1e-12 * np.eye(2)
-        side = lines.T @ residual
-        squares[axis] = residual @ residual - side @ np.linalg.solve(known, side)
+        information, vector = line.T @ line + 1e-12 * np.eye(2), line.T @ residual
+        squares[axis] = residual @ residual - vector @ np.linalg.solve(information, vector)
         freedom[axis] = n - 2
     return np.maximum(squares, 0.0), freedom
 
@@ -185,28 +184,29 @@ class Chain(NamedTuple):
 
         gram: (WIDTH, WIDTH), or (C, WIDTH, WIDTH) at each point; None for a section without rows.
         """
-        own = np.arange(SLOW)
+        diagonal = np.arange(SLOW)
         memory = np.exp(-seconds / slow.memory_s)
-        driven = slow.std**2 * (1.0 - memory**2)
-        head, side, rest = self.gram[:, :SLOW, :SLOW].copy(), self.gram[:, :SLOW].copy(), self.gram.copy()
-        side[:, :, :SLOW] = rest[:, :SLOW] = rest[:, :, :SLOW] = 0.0
-        head[:, own, own] += memory**2 / driven
-        side[:, own, own] = -memory / driven
-        rest[:, own, own] = 1.0 / driven
+        driven = slow.std**2 * (1.0 - memory**2)  # variance that the process gains along the section
+        # blocks of the Gram matrix over [slow errors at the start | slow errors at the end, states, residual]
+        start, between, end = self.gram[:, :SLOW, :SLOW].copy(), self.gram[:, :SLOW].copy(), self.gram.copy()
+        between[:, :, :SLOW] = end[:, :SLOW] = end[:, :, :SLOW] = 0.0
+        start[:, diagonal, diagonal] += memory**2 / driven
+        between[:, diagonal, diagonal] = -memory / driven
+        end[:, diagonal, diagonal] = 1.0 / driven
         if gram is not None:
-            head += gram[..., :SLOW, :SLOW]
-            side += gram[..., :SLOW, SLOW:]
-            rest += gram[..., SLOW:, SLOW:]
-        without, more = _without(head, side, rest)
-        return Chain(without, self.log_determinant + np.log(driven).sum(axis=1) + more)
+            start += gram[..., :SLOW, :SLOW]
+            between += gram[..., :SLOW, SLOW:]
+            end += gram[..., SLOW:, SLOW:]
+        complement = _schur_complement(start, between, end)
+        log_determinant = self.log_determinant + np.log(driven).sum(axis=1) + np.linalg.slogdet(start)[1]
+        return Chain(complement, log_determinant)
 
     def ended(self) -> Eliminated:
         """Eliminate the slow errors at the end."""
-        side = self.gram[:, :SLOW]
-        rest, more = _without(side[:, :, :SLOW], side[:, :, SLOW:], self.gram[:, SLOW:, SLOW:])
-        return Eliminated(rest, self.log_determinant + more)
+        slow, between, rest = self.gram[:, :SLOW, :SLOW], self.gram[:, :SLOW, SLOW:], self.gram[:, SLOW:, SLOW:]
+        return Eliminated(_schur_complement(slow, between, rest), self.log_determinant + np.linalg.slogdet(slow)[1])
 
 
-def _without(head: Array, side: Array, rest: Array) -> tuple[Array, Array]:
-    """Return the Schur complement of [[head, side], [sideᵀ, rest]] after its head, and log determinant of the head."""
-    return rest - side.transpose(0, 2, 1) @ np.linalg.solve(head, side), np.linalg.slogdet(head)[1]
+def _schur_complement(eliminated: Array, between: Array, rest: Array) -> Array:
+    """Return the information on the rest after elimination, of [[eliminated, between], [betweenᵀ, rest]]."""
+    return rest - between.transpose(0, 2, 1) @ np.linalg.solve(eliminated, between)

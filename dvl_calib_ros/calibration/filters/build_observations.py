@@ -52,7 +52,7 @@ class Observer:
                 None if attitude is None else attitude[:, 4:], interval, assumptions=self._assumptions,
                 oriented=None if attitude is None else block.oriented,
             )  # fmt: skip
-        rotation, earth = _reference_in_body(block)
+        rotation, earth_in_body = _reference_in_body(block)
         reference = block.reference[:, :3]
         unmeasured = None
         if block.unmeasured.any():
@@ -71,7 +71,7 @@ class Observer:
             interval=interval,
             assumptions=self._assumptions,
             unmeasured=unmeasured,
-            earth_in_body=earth,
+            earth_in_body=earth_in_body,
         )
 
     def _paired_noise(self, block: AlignedBlock, rotation_body_from_reference: Array | None) -> Array:
@@ -88,19 +88,20 @@ class Observer:
 
 
 def _reference_in_body(block: AlignedBlock) -> tuple[Array | None, Array | None]:
-    """Return rotations (N, 3, 3) of references to the body frame, and `Observations.earth_in_body`.
+    """Return rotation_body_from_reference (N, 3, 3), and `Observations.earth_in_body` (N, 3, 2).
 
     None, None if all references are in the body frame.
     """
     frames: Codes = block.frames
-    if not frames.any():
+    if not frames.any():  # 0 is the body frame
         return None, None
-    # attitude is enu from body; its inverse rotates ENU to the body
-    attitude = np.where((frames == _BODY)[:, None], (0.0, 0.0, 0.0, 1.0), block.attitude[:, :4])
-    rotation = rotation_from_quaternion(attitude * (-1.0, -1.0, -1.0, 1.0))
-    earth = rotation[:, :, :2] * (frames != _BODY)[:, None, None]
-    is_ned = frames == _NED
-    return np.where(is_ned[:, None, None], rotation @ ENU_FROM_NED, rotation) if is_ned.any() else rotation, earth
+    enu_from_body = np.where((frames == _BODY)[:, None], (0.0, 0.0, 0.0, 1.0), block.attitude[:, :4])
+    body_from_enu = rotation_from_quaternion(enu_from_body * (-1.0, -1.0, -1.0, 1.0))
+    earth_in_body = body_from_enu[:, :, :2] * (frames != _BODY)[:, None, None]
+    is_ned = (frames == _NED)[:, None, None]
+    if not is_ned.any():
+        return body_from_enu, earth_in_body
+    return np.where(is_ned, body_from_enu @ ENU_FROM_NED, body_from_enu), earth_in_body
 
 
 class RowsSeen(NamedTuple):

@@ -264,13 +264,13 @@ class Group:
         return PastStates(state, snapshot.used[:, index], snapshot.nis_sum[:, index])
 
     def states_without_folds(self, name: str) -> list[GaussianState]:
-        """Return state and covariance of one model without each fold."""
+        """Return state and covariance of one model without each fold; with it if the rest is singular."""
         assert self._folds is not None  # the bank was made with verified=True
         index, found = self.index[name], []
         for fold in range(FOLDS):
             try:
                 found.append(self._assembler.state(index, *self._folds.state(fold, index)))
-            except np.linalg.LinAlgError:
+            except np.linalg.LinAlgError:  # nothing but that fold determines a state
                 found.append(self.state(name))
         return found
 

@@ -189,32 +189,35 @@ class Readings:
         """
         if len(self) < FEWEST_VALUES:
             return []
-        known = rotation_dvl_from_body
-        prior = np.eye(3) if known is None else known
-        results = []
-        for reading in readings:
-            motion = self._read(reading)
-            if motion is None:
-                continue
-            body = linear_at(motion.reference_times, motion.reference, self._at)
-            if motion.in_earth:
-                body = np.einsum("nji,nj->ni", attitude_at(motion.imu, self._at, GAP_S)[0], body)
-            if self._position.any():
-                body = body + np.nan_to_num(cross(angular_velocity_at(motion.turns, self._at, GAP_S), self._position))
-            dvl = self._dvl @ FLU_FROM_FRD if reading.turned else self._dvl
-            speed = _rms(dvl)
-            best = best_rotation(dvl, body, prior)
-            # second pass without outliers
-            errors = squared(dvl - body @ best.T)
-            kept = errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))]
-            best = best_rotation(dvl[kept], body[kept], prior)
-            best_residual = _rms(dvl - body @ best.T) / speed
-            residual = best_residual if known is None else _rms(dvl - body @ known.T) / speed
-            travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
-            is_ahead = bool(travel[1] < max(travel[0], MIN_SIDEWAYS * speed))
-            results.append(Agreement(reading, residual, best, best_residual, is_ahead))
+        found = [self._agreement(reading, rotation_dvl_from_body) for reading in readings]
+        possible = [each for each in found if each is not None]
         # a small penalty prefers the smaller rotation; rounding makes ties stable (two inverted worlds fit equally)
-        return sorted(results, key=lambda each: round(each.residual + (0.02 * each.angle if known is None else 0.0), 9))
+        penalty = 0.02 if rotation_dvl_from_body is None else 0.0
+        return sorted(possible, key=lambda each: round(each.residual + penalty * each.angle, 9))
+
+    def _agreement(self, reading: Reading, known: Array | None) -> Agreement | None:
+        """Compare velocities under a reading; None without its attitude. known: see `agreements`."""
+        motion = self._read(reading)
+        if motion is None:
+            return None
+        prior = np.eye(3) if known is None else known
+        body = linear_at(motion.reference_times, motion.reference, self._at)
+        if motion.in_earth:
+            body = np.einsum("nji,nj->ni", attitude_at(motion.imu, self._at, GAP_S)[0], body)
+        if self._position.any():
+            body = body + np.nan_to_num(cross(angular_velocity_at(motion.turns, self._at, GAP_S), self._position))
+        dvl = self._dvl @ FLU_FROM_FRD if reading.turned else self._dvl
+        speed = _rms(dvl)
+        best = best_rotation(dvl, body, prior)
+        # second pass without outliers
+        errors = squared(dvl - body @ best.T)
+        kept = errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))]
+        best = best_rotation(dvl[kept], body[kept], prior)
+        best_residual = _rms(dvl - body @ best.T) / speed
+        residual = best_residual if known is None else _rms(dvl - body @ known.T) / speed
+        travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
+        is_ahead = bool(travel[1] < max(travel[0], MIN_SIDEWAYS * speed))
+        return Agreement(reading, residual, best, best_residual, is_ahead)
 
     def registered(self, reading: Reading, rotation_dvl_from_body: Array | None) -> Registered:
         """Register a reading with free lever arm and DVL delay.
@@ -225,31 +228,31 @@ class Readings:
         (rotated about the direction of travel) look alike: the upright one is returned unless the other fits clearly
         better.
         """
-        flu_from_dvl = FLU_FROM_FRD if reading.turned else np.eye(3)
-        fit = self._fit(reading)
-
-        def fitted_with(rotation: Array | None) -> Registered:
-            """Return the fit for a nominal DVL rotation, or for the fitted one if None."""
-            nominal = None if rotation is None else rotation.T @ flu_from_dvl
-            fitted = nearest(fit, nominal, (REFERENCE,)) if fit else None
-            if fitted is None:
-                return NOT_REGISTERED
-            residual = math.sqrt(float(_smallest_share(fitted.squares).mean())) / max(fitted.speed, 1e-9)
-            compared_with = fitted.rotation_body_from_dvl if nominal is None else nominal
-            rotation_found = flu_from_dvl @ fitted.rotation_body_from_dvl.T
-            return Registered(misfit(fitted, compared_with, residual), rotation_found, fitted.x[ARM], fitted.std[ARM])
-
         if rotation_dvl_from_body is not None:
-            return fitted_with(rotation_dvl_from_body)
-        best = fitted_with(None)
-        rolled = fitted_with(best.rotation_dvl_from_body @ FLU_FROM_FRD)
+            return self._registered_with(reading, rotation_dvl_from_body)
+        best = self._registered_with(reading, None)
+        rolled = self._registered_with(reading, best.rotation_dvl_from_body @ FLU_FROM_FRD)
         upright, other = sorted((best, rolled), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
         return other if other.residual < BETTER_BY * upright.residual else upright
 
+    def _registered_with(self, reading: Reading, rotation_dvl_from_body: Array | None) -> Registered:
+        """Register a reading from one mounting (3, 3); None to estimate it."""
+        flu_from_dvl = FLU_FROM_FRD if reading.turned else np.eye(3)
+        nominal = None if rotation_dvl_from_body is None else rotation_dvl_from_body.T @ flu_from_dvl
+        fit = self._fit(reading)
+        fitted = nearest(fit, nominal, (REFERENCE,)) if fit else None
+        if fitted is None:
+            return NOT_REGISTERED
+        residual = math.sqrt(float(_smallest_share(fitted.squares).mean())) / max(fitted.speed, 1e-9)
+        compared_with = fitted.rotation_body_from_dvl if nominal is None else nominal
+        rotation_found = flu_from_dvl @ fitted.rotation_body_from_dvl.T
+        return Registered(misfit(fitted, compared_with, residual), rotation_found, fitted.x[ARM], fitted.std[ARM])
+
     def are_axes_mirrored(self, reading: Reading, rotation_found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
-        motion, flu_from_dvl = self._read(reading), FLU_FROM_FRD if reading.turned else np.eye(3)
-        rotated = nearest(fit, rotation_found.T @ flu_from_dvl, (REFERENCE,)) if (fit := self._fit(reading)) else None
+        flu_from_dvl = FLU_FROM_FRD if reading.turned else np.eye(3)
+        motion, fit = self._read(reading), self._fit(reading)
+        rotated = nearest(fit, rotation_found.T @ flu_from_dvl, (REFERENCE,)) if fit else None
         if motion is None or rotated is None:
             return False
         mounting = rotation_dvl_from_body.T @ flu_from_dvl

@@ -251,13 +251,15 @@ class Track(RowTable):
         """
         n_events = len(horizon_ns)
         before_ns = LONG_AGO_NS if self.newest_ns is None else self.newest_ns
+        # once this stream has reached the time
         reached_at = np.append(arrived, n_events)[np.searchsorted(new_ns, stamps_ns)]
         decided = np.where(stamps_ns <= before_ns, since, np.maximum(since, reached_at))
-        # time up to which this stream is given up after an event; it grows while the stream is silent
+        # or once it is overdue: time up to which it is given up after an event, which grows while it is silent
         overdue = newest_ns + self.max_gap_ns + self.max_latency_ns <= horizon_ns
         if not overdue.any():
             return decided
         given_up_ns = np.where(overdue, horizon_ns - self.max_latency_ns, LONG_AGO_NS)
+        # stretches of events without a new sample, of those that end overdue
         bounds = np.concatenate([[0], np.flatnonzero(np.diff(newest_ns)) + 1, [n_events]])
         with_overdue = np.flatnonzero(given_up_ns[bounds[1:] - 1] != LONG_AGO_NS)
         for start, stop in zip(bounds[with_overdue].tolist(), bounds[with_overdue + 1].tolist(), strict=True):
