@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +13,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
 from ..calibration.comparison.mounting_change import Change, Comparison
-from ..calibration.results.extrinsics import Extrinsics
+from ..calibration.results.extrinsics import N_COMPONENTS, Extrinsics
 from ..fleet_catalogue.vehicle_history import CompassDeviation
 from .comparison import ComparedQuantity, shown_quantities
 from .figure_style import INK, Picture, drawing, legend_above, new_figure, picture
@@ -26,10 +26,10 @@ PNG_DPI = 160
 MOST_LISTED = 20
 
 
-def trend(comparison: Comparison) -> list[Picture]:
-    """Draw every quantity observable in two calibrations, one picture each."""
+def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONENTS)) -> list[Picture]:
+    """Draw every quantity observable in two calibrations, one picture each. components: restrict to these."""
     pictures = []
-    for quantity in shown_quantities(comparison):
+    for quantity in (each for each in shown_quantities(comparison) if each.component in components):
         at = quantity.component
         known = [each for each in comparison.calibrations if each.shown[at]]
         values_text = ", ".join(

@@ -112,8 +112,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> _Misfits:
             body = _Series(values, known, body.squares * known)
         sums = _sums_over_lags(_spectra(body, size), dvl_spectra, rotation, size, max_shift)
         is_enough = (sums.n_steps >= min_count) & (sums.squares > 0.0)
-        left = sums.squares - 2.0 * sums.correlation
-        misfit[row, is_enough] = left[is_enough] / (0.5 * sums.squares[is_enough])
+        misfit[row, is_enough] = (sums.squares - 2.0 * sums.correlation)[is_enough] / (0.5 * sums.squares[is_enough])
     return _Misfits(delays, np.maximum(misfit, 0.0))
 
 
