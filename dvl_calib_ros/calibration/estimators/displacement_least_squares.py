@@ -41,6 +41,7 @@ LASTING_S: tuple[float, ...] = (20.0, 60.0, 180.0, 600.0)
 WALKED, WALK_S = (0.0, 0.03, 0.3, 3.0), 300.0
 DEVIATES: Array = np.array([0.3, 1.0, 3.0])
 _DEVIATES_LOG: Array = -0.5 * (np.log(DEVIATES) / np.log(4.0)) ** 2
+# Prior σ of the heading coefficients (one cycle, two cycles, drift over the run), relative to the same parameter.
 _SHARE: Array = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
 # Variance of a stretch's constant, relative to the largest other variance.
 FREE_VARIANCE = 1e5

@@ -301,7 +301,7 @@ def _at_references(joined: JoinedBlocks, x: Array, parameters: Parameters) -> _A
 def _velocity_in_body(streams: _AtReferences, x: Array, parameters: Parameters) -> tuple[Array, Array]:
     """Return the velocity (J, 3) m/s of the reference point by the DVL, body frame, and its derivatives (J, 3, 20).
 
-    x: (20,) states that correct it, and by which it is differentiated.
+    It is Tᵀ (I + [φ×])⁻¹ (v - b) / (1 + δk) - ω × l, with the states x (20,), by which it is differentiated.
     """
     t = parameters.rotation_dvl_from_body
     inverse = np.linalg.inv(np.eye(3) + skew(x[PHI]))

@@ -101,12 +101,13 @@ def binned_rows(rows: PredictedRows, row_weight: Array, from_s: float, end_s: fl
     first = np.flatnonzero(np.diff(bins, prepend=-1.0))
     total = np.add.reduceat(weight, first, axis=0)
     share = weight / np.maximum(np.repeat(total, np.diff(np.append(first, len(bins))), axis=0), 1e-12)
-    both = np.concatenate([rows.columns, rows.residual[:, :, None]], axis=2)
-    mean = np.add.reduceat(both * share[:, :, None], first)
+    states_and_residual = np.concatenate([rows.columns, rows.residual[:, :, None]], axis=2)
+    mean = np.add.reduceat(states_and_residual * share[:, :, None], first)
     slow = np.add.reduceat(rows.slow * share[:, :, None], first)
+    # slow errors are linear between the ends of the section: fraction of the way
     fraction = np.add.reduceat((rows.times[:, None] - from_s) / (end_s - from_s) * share, first)[:, :, None]
-    whole = np.concatenate([(1.0 - fraction) * slow, fraction * slow, mean], axis=2)
-    return Bins(whole, total, rows.fold[first])
+    columns = np.concatenate([(1.0 - fraction) * slow, fraction * slow, mean], axis=2)
+    return Bins(columns, total, rows.fold[first])
 
 
 def scatter(bins: Bins) -> tuple[Array, Array]:

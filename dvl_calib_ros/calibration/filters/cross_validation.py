@@ -247,7 +247,7 @@ def calibration_error(
 ) -> float:
     """Return the velocity error, m/s rms, due to a state covariance (n, n) on judged samples; 0 for none.
 
-    judged: the first two sums of `Moments`.
+    judged: `MomentSums.samples` and `vv` of all samples.
     """
     samples, vv = judged
     error_covariance = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T

@@ -89,8 +89,9 @@ def observability(
             axis = _BODY_AXES[int(np.argmax(np.abs(parameters.rotation_dvl_from_body[index]) * in_body))]
         else:
             axis = _scale_axis(model, index, parameters)
-        missing = "" if observed else tilt_needs if tilt_needs and axis in _BODY_AXES[:2] else model.shown_by[axis]
-        entries.append(Observability(name, std, observed, axis, missing, _progress(std, prior_std[index], fine_std)))
+        needed = tilt_needs if tilt_needs and axis in ("roll", "pitch") else model.shown_by[axis]
+        progress = _progress(std, prior_std[index], fine_std)
+        entries.append(Observability(name, std, observed, axis, "" if observed else needed, progress))
     for index, name in enumerate(model.state_names[model.n_errors :], start=model.n_errors):
         if name in model.shown_by:  # published nuisance state
             std = math.sqrt(covariance[index, index])
@@ -102,6 +103,7 @@ def observability(
 
 
 def _progress(std: float, prior_std: float, fine_std: float) -> float:
+    """Return `Observability.progress`."""
     if std <= fine_std:
         return 1.0
     return 0.0 if std >= prior_std else math.log(prior_std / std) / math.log(prior_std / fine_std)

@@ -196,6 +196,7 @@ class MotionFit:
         """Prepare a fit. lever_arm: (3,) m configured. curves: smoothed motion. most: most references used."""
         self._motion, self._lever_arm, self._curves = motion, lever_arm, curves
         self.is_turned = motion.in_earth and motion.has_attitude
+        self._measured = np.array(motion.measured)
         m = motion
         moving = np.flatnonzero(squared(m.reference) >= MIN_SPEED_MPS**2)
         if len(moving) > most:
@@ -306,11 +307,10 @@ class MotionFit:
         assert compared is not None
         # the velocity along each axis of the DVL, in the direction of that axis in the body
         in_body = -(1.0 + fitted.x[SCALE]) * compared.velocity[:, None, :] * fitted.rotation_body_from_dvl
-        measured = np.array(self._motion.measured)
-        if measured.all():
+        if self._measured.all():
             return np.asarray(in_body)
         columns = compared.rotation_enu_from_body @ in_body if self._motion.in_earth else in_body
-        return np.asarray(columns[:, measured])
+        return np.asarray(columns[:, self._measured])
 
     def _interpolated(self, rho: float, delta: float, among: Fitted | None = None) -> _AtDelays | None:
         """Return the streams at delays ρ and δ (s), or None for too few references. among: see `__call__`."""
@@ -365,12 +365,11 @@ class MotionFit:
         jacobian[:, :, ARM] = skew(rates)
         jacobian[:, :, DELTA] = -(1.0 + x[SCALE]) * compared.slope @ rotation.T
         jacobian[:, :, RHO] = cross(rates, body)
-        measured = np.array(self._motion.measured)
-        if not measured.all():
+        if not self._measured.all():
             if self._motion.in_earth:
                 residual = np.einsum("nij,nj->ni", rotation_enu_from_body, residual)
                 jacobian = rotation_enu_from_body @ jacobian
-            residual, jacobian = residual[:, measured], jacobian[:, measured]
+            residual, jacobian = residual[:, self._measured], jacobian[:, self._measured]
         delay_noise = compared.slope_noise_gain * self.dvl_noise * residual.shape[1]
         speed = float(np.sqrt(squared(body).mean()))
         return _Rows(residual, jacobian, compared.at, delay_noise, speed)

@@ -203,7 +203,7 @@ def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_
 def _registered(
     motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, *, are_clocks_steady: bool
 ) -> Registration | None:
-    """Register a motion, see `register`. are_clocks_steady: search for no clock change."""
+    """Register a motion, see `register`. are_clocks_steady: skip the search for a clock change."""
     curves = Curves(motion)
     full, quick = (MotionFit(motion, lever_arm, curves, most) for most in (FULL_ROWS, QUICK_ROWS))
     likeliest = _fit_at_likeliest_delays(motion, quick, rotation_body_from_dvl)

@@ -142,15 +142,15 @@ class InBody(NamedTuple):
 
 def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody:
     """Rotate references to the body by attitudes ``rotation_enu_from_body`` (J, 3, 3) where known (J,)."""
-    in_body = reference.in_body
-    if in_body.all():
-        n = len(in_body)
+    is_in_body = reference.in_body
+    if is_in_body.all():
+        n = len(is_in_body)
         return InBody(reference.velocity, reference.noise, np.ones(n, dtype=bool), np.zeros((n, 3, 2)))
-    body_from_enu = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
-    velocity = np.matmul(body_from_enu, reference.velocity[..., None])[..., 0]
-    noise = body_from_enu @ reference.noise @ body_from_enu.swapaxes(1, 2)
-    earth = body_from_enu[:, :, :2] * ~in_body[:, None, None]
-    return InBody(velocity, noise, known | in_body, earth)
+    body_from_reference = np.where(is_in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
+    velocity = np.matmul(body_from_reference, reference.velocity[..., None])[..., 0]
+    noise = body_from_reference @ reference.noise @ body_from_reference.swapaxes(1, 2)
+    earth_in_body = body_from_reference[:, :, :2] * ~is_in_body[:, None, None]
+    return InBody(velocity, noise, known | is_in_body, earth_in_body)
 
 
 def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
