@@ -520,9 +520,8 @@ class DeadReckoning:
         fixes, at_s, after = fixes.part(np.flatnonzero(known)), at_s[known], after[known]
         share = ((at_s - seconds[after - 1]) / (seconds[after] - seconds[after - 1]))[:, None]
         found = sums[after - 1] + share * (sums[after] - sums[after - 1])
-        near = np.where(share < 0.5, after[:, None] - 1, after[:, None])[:, 0]
-        n = len(at_s)
-        rotation = rotation_from_quaternion(quaternion[near])
+        n, nearest = len(at_s), after - (share[:, 0] < 0.5)
+        rotation = rotation_from_quaternion(quaternion[nearest])
         rate = (rates[after - 1] + share * (rates[after] - rates[after - 1]))[:, _WAY].reshape(n, 3, 3, 3)
         velocity = np.einsum("nabc,bc->na", rate, self._body_from_dvl)
         way, drifted = found[:, _WAY].reshape(n, 3, 3, 3), found[:, _DRIFTED].reshape(n, 3, N_HEADING)

@@ -354,13 +354,13 @@ class JointFit:
 
     def _measure_noise(self, day: _Day, parts: Sequence[SectionRows]) -> None:
         """Estimate the white noise of single rows and of bins from their scatter within sections."""
-        left = [part.left for part in parts if part.rows is not None]
-        if not left:
+        residuals = [part.residual for part in parts if part.rows is not None]
+        if not residuals:
             return
         levels = np.array([part.level for part in parts if part.rows is not None])
         day.level = masked_median(levels)
         day.level_std = np.maximum(masked_median(np.abs(levels - day.level)) / MEDIAN_DISTANCE, GROSS_MPS / GROSS)
-        day.single = np.maximum(usual_square(np.concatenate(left)), ROUNDING_MPS**2)
+        day.single = np.maximum(usual_square(np.concatenate(residuals)), ROUNDING_MPS**2)
         each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
         total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))
         white = np.maximum(total / np.maximum(freedom, 1.0), ROUNDING_MPS**2)

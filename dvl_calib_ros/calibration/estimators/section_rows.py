@@ -23,7 +23,7 @@ TRIMMED_SQUARE = 0.623
 
 
 class SectionRows:
-    """Rows of one section. level: (3,) m/s, median. left: (J, 3) m/s about the median, nan along unmeasured axes."""
+    """Rows of one section. level: (3,) m/s, median. residual: (J, 3) m/s about the median, nan if not measured."""
 
     def __init__(self, from_s: float, rows: PredictedRows | None, block: FitBlock) -> None:
         self.from_s, self.rows, self._bin_s = from_s, rows, _bin_length_s(block)
@@ -32,7 +32,7 @@ class SectionRows:
         if rows is not None:
             residual = np.where(rows.weight > 0.0, rows.residual, np.nan)
             self.level = masked_median(residual)
-            self.left = residual - self.level
+            self.residual = residual - self.level
 
     def with_effects(self, velocities: Callable[[Array], Array]) -> SectionRows:
         """Return the rows with derivatives by effects, from `velocities` (N, 3, k) that a DVL (N, 3) has too much."""
@@ -44,7 +44,7 @@ class SectionRows:
 
     def misfit(self, single: Array) -> Array:
         """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
-        found: Array = (np.nan_to_num(self.left) ** 2 / single).sum(axis=1)
+        found: Array = (np.nan_to_num(self.residual) ** 2 / single).sum(axis=1)
         return found
 
     def up(self, x: Array) -> Array | None:

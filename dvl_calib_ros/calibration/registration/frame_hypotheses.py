@@ -267,7 +267,7 @@ class Readings:
         return rotation_dvl_from_body if is_needed else unrolled
 
     def is_in_body(self, found: Agreement) -> bool:
-        """Return whether DVL and reference that agree in the body are not both in the earth frame."""
+        """Return whether DVL and reference are in the body: they also agree if both are in the earth frame."""
         motion = self._read(replace(found.reading, reference=VelocityFrame.ENU.value))
         if motion is None:
             return True
