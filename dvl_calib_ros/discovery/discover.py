@@ -185,8 +185,9 @@ class _Search:
             if role == "reference" and look is not None:
                 chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame
                 declared = self._declared_reference(look)
-                shown = chosen if chosen != FROM_FRAME_ID else "" if declared is None else declared.name
-                frame = f", {shown}" if shown else ""
+                if chosen == FROM_FRAME_ID:
+                    chosen = "" if declared is None else declared.name
+                frame = f", {chosen}" if chosen else ""
             parts.append(f"{role} {name} ({kind.split('/')[-1]}{frame}{rate})")
         return "; ".join(parts)
 

@@ -236,6 +236,7 @@ class _Numbers:
         self.world = self.world or laid.world
         of_each = laid.variances.mean(axis=1) if self._kind is not None else np.array([laid.heading_variance])
         self._variances.append(of_each)
+        # the first message with a frame suffices
         self._names += [
             (int(arrival), part.laid.frames[place])
             for arrival, place in zip(laid.arrival.tolist(), laid.frame.tolist(), strict=True)
