@@ -7,6 +7,7 @@ A reference delay pairs velocities with attitudes of another time, which looks a
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -125,10 +126,10 @@ class _Registered:
             ImuColumns(*(column.copy() for column in imu)),
         )  # fmt: skip
 
-    def _columns(self) -> tuple[list[Any], ...]:
-        return tuple(
-            [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
-        )
+    def _columns(self) -> Iterator[list[Any]]:
+        """Yield the columns of each stream, as views."""
+        for stream in self._streams:
+            yield [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT]
 
 
 class FitSoFar(NamedTuple):
