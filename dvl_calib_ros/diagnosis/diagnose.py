@@ -44,7 +44,7 @@ from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
 from .search.observable_parameters import default_values, with_observable
-from .search.unexplained import Unexplained, find_unexplained, is_predictive, nuisance_shift, without_replaceable
+from .search.unexplained import Unexplained, find_unexplained, nuisance_shift, without_replaceable
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 
@@ -120,7 +120,7 @@ def diagnose_recordings(
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, unexplained, gap, len(visible) / len(testable))
-    if verdict is DiagnosisVerdict.UNKNOWN and unexplained.found:  # the unknown cause may contribute
+    if unexplained.found:  # the unknown cause may contribute
         shift = nuisance_shift(selection.fitter.problem, selection.fit, unexplained)
         covariance = covariance + np.outer(shift, shift)
     covariance = with_observable(selection.fitter.problem, selection.fit, covariance)
@@ -130,7 +130,7 @@ def diagnose_recordings(
         _found_effect(selection, each, covariance, unchanged, times, len(testable), gap) for each in selection.selected
     )
     columns = unexplained.columns
-    if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and unexplained.found):
+    if selection.selected and not unexplained.found:
         columns = selection.fit.columns[:, :, 6:]
     is_gap = verdict in (DiagnosisVerdict.KNOWN, DiagnosisVerdict.AMBIGUOUS, DiagnosisVerdict.UNKNOWN)
     hypothesis = selection.fit.hypothesis
@@ -234,9 +234,7 @@ CODES = {
 
 def _verdict(selection: EffectSelection, unexplained: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
     """Return the verdict; a systematic residual or a failure on held-out data makes it unknown."""
-    if is_predictive(selection.fitter.problem, selection.fit, unexplained):
-        return DiagnosisVerdict.UNKNOWN
-    if gap.fails_held_out:
+    if unexplained.found or gap.fails_held_out:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected and gap.closure < MIN_CLOSURE:
         return DiagnosisVerdict.UNKNOWN

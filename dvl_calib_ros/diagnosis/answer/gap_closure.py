@@ -17,7 +17,7 @@ from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
-from ..search.unexplained import Unexplained, is_predictive
+from ..search.unexplained import Unexplained
 
 RESAMPLES = 1000
 # Least ratio of the unexplained error to the noise that is reported
@@ -279,7 +279,7 @@ def noise_floor(selection: EffectSelection, unexplained: Unexplained) -> Array:
     residual, measured = problem.errors(fit.seen), np.array(problem.measured)
     slow = SlowNoiseOfFit.of_fit(problem, fit)
     noise, slow_residual, explained = slow.noise, slow.left, np.zeros(len(slow.left))
-    if is_predictive(problem, fit, unexplained):
+    if unexplained.found:
         *_, noise, without = slow.with_nuisance(problem, slow.noise, unexplained.clearest)
         explained, slow_residual = (slow_residual**2 - without**2).sum(axis=1), without
     expected = noise.energy

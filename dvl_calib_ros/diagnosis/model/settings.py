@@ -20,7 +20,8 @@ class DiagnosisSettings:
 
     Finding: level: family-wise, of any effect. max_effects: largest number of effects. indistinguishable: deviance
     within which two explanations are equivalent: for a rival better by d, the odds are those of a normal variable
-    beyond √d. robust_level: p of an effect from the scatter of blocks, valid for noise of any colour.
+    beyond √d. robust_level: p under noise of any colour, of an effect by the scatter of blocks, and of each kind of
+    regressor that a residual may follow by held-out data.
 
     outlying: robust standard deviations of an outlier. conclusive: deviance that leaves no doubt between two fits.
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array
 from ...effects.base import recursion
 from ..model.forward_model import Problem
@@ -21,6 +23,28 @@ TURNING_RADPS = float(np.deg2rad(2.0))
 # Groups tested in parts of this many functions: one, or a cosine and its sine
 ALTERNATIVES = {"a band of speeds": 1, "turns before": 1, "heading": 2}
 HEADING_HARMONICS = 4
+
+
+class Regressor(NamedTuple):
+    """What a residual may follow, with its test.
+
+    about: its name, or a period (s). columns: (M, A, c). energy: chi-square of dof under the null, once divided by its
+    inflation in simulated recordings. log_tried: logarithm of the number of alternatives, such as times of an event.
+    left: deviance that inexact interpolation may leave, where no simulated recordings tell.
+    """
+
+    about: str | float
+    columns: Array
+    energy: float
+    dof: int
+    log_tried: float = 0.0
+    inflation: float = 1.0
+    left: float = 0.0
+
+    @property
+    def log_p(self) -> float:
+        """Return log p of the test, adjusted for the alternatives."""
+        return (float(chi2_logsf(self.energy / self.inflation, self.dof)) if self.dof else 0.0) + self.log_tried
 
 
 def dictionary(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:

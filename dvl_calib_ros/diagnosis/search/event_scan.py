@@ -7,7 +7,6 @@ slow noise absorbs such an error unless the time of the event is searched.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from ..fit.gauss_newton import Fit
 from ..model.forward_model import Problem
 from ..model.hypothesis import is_time_of_run
 from ..noise.whitened_least_squares import ScoreTest
+from .alternative_regressors import Regressor
 
 # Largest number of times of a step or of a pulse of one width, so that an hour costs as much per sample as minutes;
 # events whitened together, whose columns share one Gram matrix
@@ -27,16 +27,7 @@ TIME_TOLERANCE_S = 4.0
 HALF_WIDTHS_S = (8.0, 24.0, 72.0)
 
 
-class Event(NamedTuple):
-    """Most significant event of a kind. log_p: adjusted for all times; columns: (M, A, c); tried: number of times."""
-
-    about: str
-    log_p: float
-    columns: Array
-    tried: int
-
-
-def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event]:
+def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Regressor]:
     """Return the most significant step and pulses of a residual.
 
     basis: orthonormal (m, k) of the fit's whitened columns, with its prior rows. white: (m,) whitened residual of unit
@@ -47,7 +38,7 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
         error = error_of(problem, fit)
         if error is None:
             continue
-        best, tried, event = 0.0, 0, np.zeros((*error.shape[:2], error.shape[2]))
+        best, tried = Regressor(about, error, 0.0, 0), 0
         for rows in problem.rows_of:
             profiles = profiles_of(problem.time[rows])
             tried += profiles.shape[1]
@@ -60,13 +51,14 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
                 profile = profile[part.start - rows.start : part.stop - rows.start]
                 columns = error[part, :, None] * profile[:, None, :, None]
                 columns[excluded[part]] = 0.0
-                log_p = _log_p(fit, basis, white, columns, part)
-                at = int(np.argmin(log_p))
-                if log_p[at] < best:
-                    best, event = float(log_p[at]), np.zeros_like(event)
+                energies, ranks = _energies(fit, basis, white, columns, part)
+                at = int(np.argmax(energies))
+                if energies[at] > best.energy:
+                    event = np.zeros_like(error)
                     event[part] = columns[:, :, at]
-        if best < 0.0:
-            found.append(Event(about, best + float(np.log(tried)), event, tried))
+                    best = Regressor(about, event, float(energies[at]), int(ranks[at]))
+        if best.energy > 0.0:
+            found.append(best._replace(log_tried=float(np.log(tried))))
     return found
 
 
@@ -80,12 +72,12 @@ def _near_fitted_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     return excluded
 
 
-def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) -> Array:
-    """Return log p (K,) of each of K events with columns (m, A, K, c) in a part of the bins, zero in others."""
+def _energies(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) -> tuple[Array, NDArray[np.intp]]:
+    """Return energy and rank (K,) of events with columns (m, A, K, c) in a part of the bins, zero in others."""
     m, axes, k, c = columns.shape
     whitened = fit.noise.part(part).whiten(columns.reshape(m, axes, k * c))
     test = ScoreTest.of(basis, whitened, white, axes * part.start)
-    return test.log_p(np.arange(k * c).reshape(k, c))
+    return test.energies(np.arange(k * c).reshape(k, c))
 
 
 def _steps(time: Array) -> Array:

@@ -1,7 +1,7 @@
-"""Score tests of the residual of the best combination of effects against vehicle motion and time.
+"""What the residual of the best combination of effects follows: vehicle motion, time, a period or an event.
 
-The dictionary holds functions of motion or time, each with a free vector in the body frame. GNSS noise is independent
-of the vehicle's motion, so a residual that follows the motion is systematic.
+Score tests against a dictionary of regressors, each with a free vector in the body frame, propose. Prediction of
+held-out stretches decides, with the noise re-estimated beside the regressor: slow noise is the rival explanation.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.numerics.distributions import chi2_isf, chi2_logsf
+from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array
 from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
@@ -26,7 +26,7 @@ from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
 from ..noise.whitened_least_squares import ScoreTest, orthonormal
-from .alternative_regressors import ALTERNATIVES, dictionary
+from .alternative_regressors import ALTERNATIVES, Regressor, dictionary
 from .effect_selection import EffectSelection
 from .event_scan import events
 
@@ -36,29 +36,28 @@ SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
 STEPS_OF_A_BIN = 16
 # Degrees of freedom of the prior on the null distribution's scale of 1
 PRIOR_DOF = 4.0
+# Regressors with the most significant score tests, of which the prediction is computed
+N_PREDICTED = 8
 # Share of the effects' explained deviance that inexact interpolation may leave
 INTERPOLATION_SHARE = 0.005
-# Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
-# fifteen functions of the turn rate.
-EQUAL_LOG_P = 6.0
 # A column belongs to a group whose functions leave less than this share of its squares
 GROUP_RESIDUAL_SHARE = 0.02
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Result of the score tests. log_p: of the best entry or of all jointly, adjusted for multiple tests.
+    """What a residual follows.
 
-    about: name of the regressor, or a period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest:
-    (M, A, c), the most significant columns. penalty: quantile of the best test under the null at
-    `SETTINGS.robust_level`.
+    log_p: of the regressor's gain on held-out data, adjusted for its alternatives. about: name of the regressor, or a
+    period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest: (M, A, c), of the regressor.
+    log_tried: logarithm of its alternatives.
     """
 
     log_p: float
     about: str | float
     columns: Array
     clearest: Array
-    penalty: float = 0.0
+    log_tried: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -74,106 +73,81 @@ class Unexplained:
 
 
 def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
-    """Test the residual of a fit against the dictionary.
-
-    The null distribution is from recordings simulated from the fit (parametric bootstrap).
-    """
+    """Return the regressor with the most significant score test that predicts held-out stretches of a residual."""
     problem, noise = fitter.problem, fit.noise
-    score_tests, white, raw, basis = _score_tests(fitter, fit, problem, fit.seen, fit.residual)
-    no_columns = raw["time"][:, :, :0]
+    basis, white = _orthogonal_residual(fitter, fit, problem, fit.seen, fit.residual)
+    of_motion = _score_tests(problem, fit, fit.seen, basis, white)
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
     whitened = noise.whiten(fit.residual)
     whitened = whitened / np.sqrt(float(whitened @ whitened) / (whitened.size - basis.shape[1]))
     spectral = lines(problem, whitened.reshape(-1, problem.axes))
-    tested = len(score_tests) + len(spectral)
-    found_events = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
-    if found_events:  # slow noise explains a step as well, unless the step predicts better
-        base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
-        least = INTERPOLATION_SHARE * (base.deviance - fit.deviance)
-        found_events = [
-            each
-            for each in found_events
-            if _is_predictive(problem, fit, each.columns, least + _limit(tested + each.tried, each.columns.shape[2]))
-        ]
-    log_trials = float(np.log(tested))
-    nominal = [
-        *(each.log_p for each in found_events),
-        *(test.log_p() for test in score_tests),
-        *(line.log_p for line in spectral),
-    ]
-    if min(nominal) + log_trials > np.log(SETTINGS.robust_level):
-        return Unexplained(min(min(nominal) + log_trials, 0.0), "", no_columns, no_columns)
-    grown = _inflation_under_null(fitter, fit, score_tests)
-    tests: list[tuple[float, str | float, Array]]
-    tests = [
-        (test.log_p(by), test.name, raw[test.name][:, :, test.at]) for test, by in zip(score_tests, grown, strict=True)
-    ]
-    tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in spectral]
-    tests += [(each.log_p, each.about, each.columns) for each in found_events]
-    best = min(tests, key=_first)
-    about = _simplest(tests, best[0])
-    log_p = best[0] + log_trials
-    # the best of many lines would always explain some of the noise
-    clear = [_along_axes(line.waves, problem.axes) for line in spectral if line.log_p < np.log(SETTINGS.robust_level)]
-    columns = np.concatenate([*raw.values(), *clear], axis=2)
-    tested = next((tested + each.tried for each in found_events if each.about == best[1]), tested)
-    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _limit(tested, best[2].shape[2]))
-    return found if found.found else replace(found, columns=no_columns, clearest=no_columns)
+    base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), noise)
+    left = INTERPOLATION_SHARE * (base.deviance - fit.deviance)
+    of_time = [each._replace(left=left) for each in spectral + events(problem, fit, basis, white)]
+    log_p = min(each.log_p for each in of_motion + of_time)
+    none = fit.columns[:, :, :0]
+    if log_p > np.log(SETTINGS.robust_level):
+        return Unexplained(min(log_p, 0.0), "", none, none)
+    proposed = sorted(_inflated(fitter, fit, of_motion) + of_time, key=lambda each: each.log_p)[:N_PREDICTED]
+    log_p = 0.0
+    for each in proposed:
+        log_p = min(log_p, _predicted(problem, fit, each).log_p)
+        if log_p < np.log(SETTINGS.robust_level):
+            # the best of many lines would always explain some of the noise
+            clear = [line.columns for line in spectral if line.log_p < np.log(SETTINGS.robust_level)]
+            groups = {part.about: part.columns for part in reversed(of_motion)}  # of each the first, the whole group
+            columns = np.concatenate([*groups.values(), *clear], axis=2)
+            return Unexplained(log_p, each.about, columns, each.columns, each.log_tried)
+    return Unexplained(log_p, "", none, none)
 
 
-def _limit(tested: int, columns: int) -> float:
-    """Return the energy that the best of `tested` tests exceeds under the null with probability
-    `SETTINGS.robust_level`."""
-    return float(chi2_isf(SETTINGS.robust_level / tested, columns))
+def _predicted(problem: Problem, fit: Fit, regressor: Regressor) -> Regressor:
+    """Return a regressor with its gain in held-out deviance over slow noise as the energy of its test.
 
-
-def _simplest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
-    """Return the candidate with the fewest columns among those within `EQUAL_LOG_P` of log_p."""
-    likely = (each for each in tests if each[0] <= log_p + EQUAL_LOG_P)
-    return min(likely, key=lambda each: (each[2].shape[2], each[0]))
-
-
-def _first(each: tuple[float, str | float, Array]) -> float:
-    return each[0]
-
-
-@dataclass(frozen=True)
-class FollowTest:
-    """Score test. name: of the group; at: columns under test; energy: chi-square of dof."""
-
-    name: str
-    at: NDArray[np.intp]
-    energy: float
-    dof: int
-
-    def log_p(self, grown: float = 1.0) -> float:
-        """Return log p of the energy, divided by its inflation under the null."""
-        return float(chi2_logsf(self.energy / grown, max(self.dof, 1))) if self.dof else 0.0
-
-
-def _score_tests(
-    fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
-) -> tuple[list[FollowTest], Array, dict[str, Array], Array]:
-    """Return tests of a residual (M, A), the whitened residual, each group's columns and the basis.
-
-    The whitened residual is of unit variance, orthogonal to the fit's columns, and ends with the rows of the prior.
+    Chance gains c less of c columns on held-out data than on the data that they were fitted to.
     """
-    noise = fit.noise
+    slow, c = SlowNoiseOfFit.of_fit(problem, fit), regressor.columns.shape[2]
+    gain = predictive_gain(problem, slow, slow.with_nuisance(problem, fit.noise, regressor.columns))
+    return regressor._replace(energy=max(gain - regressor.left + c, 0.0), dof=c)
+
+
+def _orthogonal_residual(
+    fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
+) -> tuple[Array, Array]:
+    """Return an orthonormal basis (M A + k, r) of a fit's whitened columns, and a whitened residual of unit variance.
+
+    problem, seen, residual: of the recordings or of simulated ones. Basis and residual end with the rows of the prior,
+    and the residual is orthogonal to the basis.
+    """
     columns = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
-    nuisance = NuisanceFit.of(problem, fit.hypothesis, seen, columns)
+    nuisance, noise = NuisanceFit.of(problem, fit.hypothesis, seen, columns), fit.noise
     q, white = _orthogonal_to_nuisances(nuisance, noise.whiten(nuisance.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
     unobservable = nuisance.columns.shape[2] - columns.shape[2]
-    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unobservable))
-    score_tests: list[FollowTest] = []
-    raw: dict[str, Array] = {}
+    return q, white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unobservable))
+
+
+def _score_tests(problem: Problem, fit: Fit, seen: Sequence[Seen], basis: Array, white: Array) -> list[Regressor]:
+    """Return the dictionary's regressors by groups and their parts, with score tests of an `_orthogonal_residual`."""
+    found = []
     for name, functions in dictionary(problem, seen).items():
-        raw[name] = _along_axes(functions, problem.axes)
-        all_columns = ScoreTest.of(q, noise.whiten(raw[name]), white)
+        columns = _along_axes(functions, problem.axes)
+        test = ScoreTest.of(basis, fit.noise.whiten(columns), white)
         for at in _columns_of_tests(name, functions.shape[1], problem.axes):
-            score_tests.append(FollowTest(name, at, *all_columns.energy(at)))
-    return score_tests, white, raw, q
+            found.append(Regressor(name, columns[:, :, at], *test.energy(at)))
+    return [each._replace(log_tried=float(np.log(len(found)))) for each in found]
+
+
+def _inflated(fitter: Fitter, fit: Fit, of_motion: Sequence[Regressor]) -> list[Regressor]:
+    """Return regressors with the inflation of their energies over chi-square in simulated recordings, at least 1."""
+    energy, dof = np.full(len(of_motion), PRIOR_DOF), np.full(len(of_motion), PRIOR_DOF)
+    for simulated, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
+        tests = _score_tests(simulated, fit, seen, *_orthogonal_residual(fitter, fit, simulated, seen, residual))
+        energy += [test.energy for test in tests]
+        dof += [test.dof for test in tests]
+    inflation = np.maximum(energy / dof, 1.0).tolist()
+    return [each._replace(inflation=by) for each, by in zip(of_motion, inflation, strict=True)]
 
 
 def _orthogonal_to_nuisances(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
@@ -185,26 +159,7 @@ def _orthogonal_to_nuisances(known: NuisanceFit, columns: Array, white: Array) -
     return basis, np.concatenate([white, known.centre / known.std])
 
 
-def _inflation_under_null(fitter: Fitter, fit: Fit, score_tests: Sequence[FollowTest]) -> list[float]:
-    """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
-    energy, dof = np.full(len(score_tests), PRIOR_DOF), np.full(len(score_tests), PRIOR_DOF)
-    for simulated, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
-        tests, *_ = _score_tests(fitter, fit, simulated, seen, residual)
-        energy += [test.energy for test in tests]
-        dof += [test.dof for test in tests]
-    return np.maximum(energy / dof, 1.0).tolist()
-
-
-@dataclass(frozen=True)
-class SpectralLine:
-    """Most significant line of one recording. log_p: adjusted for all frequencies; waves: (M, 2) cosine and sine."""
-
-    period_s: float
-    log_p: float
-    waves: Array
-
-
-def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
+def lines(problem: Problem, innovations: Array) -> list[Regressor]:
     """Find a line in the spectrum of the innovations (M, A) of each recording that is long enough.
 
     Coloured GNSS noise has no period. Only periods longer than waves count: pairing two sensors leaves a residual of
@@ -228,32 +183,23 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
         band = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
         if not band.any():
             continue
-        log_p = np.vstack([chi2_logsf(power, 2), chi2_logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, band]
-        best = int(np.argmin(log_p.min(axis=0)))
+        energy = np.vstack([power, power.sum(axis=0)])[:, band]
+        dof = np.array([2] * innovations.shape[1] + [2 * innovations.shape[1]])
+        log_p = chi2_logsf(energy, dof[:, None])
+        which, best = np.unravel_index(int(np.argmin(log_p)), log_p.shape)
         period = 1.0 / float(frequency[band][best])
         phase = 2.0 * np.pi * time / period
         waves = np.where(rows[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
-        found.append(SpectralLine(period, float(log_p.min() + np.log(log_p.size)), waves))
+        columns, tried = _along_axes(waves, problem.axes), float(np.log(log_p.size))
+        found.append(Regressor(period, columns, float(energy[which, best]), int(dof[which]), tried))
     return found
-
-
-def is_predictive(problem: Problem, fit: Fit, unexplained: Unexplained) -> bool:
-    """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
-    return unexplained.found and _is_predictive(problem, fit, unexplained.clearest, unexplained.penalty)
-
-
-def _is_predictive(problem: Problem, fit: Fit, columns: Array, min_gain: float) -> bool:
-    """Return whether columns (M, A, c), added to a fit, gain more than the least in held-out deviance."""
-    slow = SlowNoiseOfFit.of_fit(problem, fit)
-    gain = predictive_gain(problem, slow, slow.with_nuisance(problem, fit.noise, columns))
-    return gain > min_gain - columns.shape[2]
 
 
 def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
     """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
 
-    Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
-    cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
+    Better means better prediction of held-out stretches, by more than chance. A group of functions that contains the
+    effects includes their cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
     """
     fitter, fit = selection.fitter, selection.fit
     problem, unexplained = fitter.problem, find_unexplained(fitter, fit)
@@ -264,9 +210,10 @@ def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Un
         if drop > SETTINGS.instead_of:
             continue
         new = find_unexplained(fitter, reduced.fit)
-        if not new.found or is_of_group(problem, fit, out, new.about) or not is_predictive(problem, reduced.fit, new):
+        if not new.found or is_of_group(problem, fit, out, new.about):
             continue
-        gain = _held_out_gain(problem, fit, reduced.fit, new) - SETTINGS.indistinguishable - INTERPOLATION_SHARE * drop
+        chance = max(SETTINGS.indistinguishable, 2.0 * new.log_tried)  # the best of several regressors is chosen
+        gain = _held_out_gain(problem, fit, reduced.fit, new) - chance - INTERPOLATION_SHARE * drop
         if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, new
     return (selection, unexplained) if best is None else best[1:]

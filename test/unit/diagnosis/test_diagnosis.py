@@ -56,7 +56,7 @@ from dvl_calib_ros.diagnosis.search.observable_parameters import (
     with_observable,
     without_insignificant,
 )
-from dvl_calib_ros.diagnosis.search.unexplained import Unexplained, _simplest
+from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.effects.base import ActsOn
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -1081,14 +1081,6 @@ def test_a_stretch_is_left_open_by_no_more_than_what_it_has_beyond_the_noise():
         after, after, np.ones((6, 1)), np.array([0, 0, 1, 1, 2, 2]), np.array([900.0, 1.0, 0.5, 0.5, 7.0, 0.0])
     )
     np.testing.assert_allclose(residuals.undetermined_of_blocks(), [6.0, 1.0, 0.0])
-
-
-def test_what_is_left_beyond_all_doubt_is_told_by_what_explains_it():
-    """p of 0 was no likelier than itself, and the diagnosis ended in a traceback."""
-    wide, narrow = np.zeros((4, 2, 3)), np.zeros((4, 2, 1))
-    tests = [(-np.inf, "turn rate", wide), (-np.inf, "speed", narrow), (-20.0, "time", narrow[:, :, :0])]
-    assert _simplest(tests, -np.inf)[1] == "speed"
-    assert _simplest(tests[2:], -20.0)[1] == "time"
 
 
 @pytest.mark.parametrize("name", ["lever_arm", "quadratic_scale", "mount_flexure", "attitude_time_offset"])

@@ -27,7 +27,6 @@ from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import (
     find_unexplained,
     is_of_group,
-    is_predictive,
     without_replaceable,
 )
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -113,7 +112,7 @@ def test_what_is_left_of_a_heave_that_is_hardly_there_is_there_elsewhere_as_well
     fitter, fit = with_a_wave(118.0, (0.0, 0.0, 0.01))
     rest = find_unexplained(fitter, fit)
     assert rest.about == pytest.approx(118.0, rel=0.05)
-    assert is_predictive(fitter.problem, fit, rest)
+    assert rest.found
 
 
 def test_a_period_that_no_function_of_time_follows_matters():
@@ -121,7 +120,7 @@ def test_a_period_that_no_function_of_time_follows_matters():
     fitter, fit = with_a_wave(18.0, (0.0, 0.008, 0.0))
     rest = find_unexplained(fitter, fit)
     assert rest.about == pytest.approx(18.0, rel=0.05)
-    assert is_predictive(fitter.problem, fit, rest)
+    assert rest.found
 
 
 def test_what_is_not_shown_is_no_finding_under_noise_that_is_estimated_anew_either(monkeypatch):
@@ -147,7 +146,7 @@ def test_one_harmonic_of_the_heading_is_looked_for_by_itself():
     fitter, fit = without_effects(with_added(run, third))
     rest = find_unexplained(fitter, fit)
     assert rest.about == "heading" and rest.clearest.shape[2] == 6
-    assert is_predictive(fitter.problem, fit, rest)
+    assert rest.found
 
 
 @pytest.mark.slow
@@ -198,10 +197,8 @@ def test_an_unknown_cause_takes_the_place_of_effects_only_where_it_predicts_bett
     drift = EFFECTS["misalignment_drift"]
     fitted_with = fitter.fit(no_effect().with_effects([drift], 1, {drift.name: (drift.defaults,)}), fit.noise)
     nothing = fit.columns[:, :, :0]
-    told = fit.deviance - fitted_with.deviance
-    cause = looking.Unexplained(-50.0, "speed", nothing, nothing, told)
-    monkeypatch.setattr(looking, "find_unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(looking, "is_predictive", lambda _, of, __: of.effects == ())
+    cause = looking.Unexplained(-50.0, "speed", nothing, nothing)
+    monkeypatch.setattr(looking, "find_unexplained", lambda *_: cause)
     monkeypatch.setattr(looking, "_held_out_gain", lambda *_: better)
     selected = (Selected(drift, -50.0, ()),)
     left, _ = without_replaceable(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS))
@@ -234,10 +231,9 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     fitter, fit, _ = fitted(given, {shear.name: {}})
     assert is_of_group(fitter.problem, fit, [shear], about) is is_some
     none = fitter.fit(fit.hypothesis.with_effects([], 1, {}), fit.noise)
-    nothing, told = fit.columns[:, :, :0], 0.82 * (none.deviance - fit.deviance)
-    cause = looking.Unexplained(-50.0, about, nothing, nothing, told)
-    monkeypatch.setattr(looking, "find_unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(looking, "is_predictive", lambda _, of, __: of.effects == ())
+    nothing = fit.columns[:, :, :0]
+    cause = looking.Unexplained(-50.0, about, nothing, nothing)
+    monkeypatch.setattr(looking, "find_unexplained", lambda *_: cause)
     monkeypatch.setattr(looking, "_held_out_gain", lambda *_: 1000.0)
     left, _ = without_replaceable(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
     assert bool(left.selected) == is_some
@@ -254,7 +250,7 @@ def test_one_event_is_found_whenever_it_happens(about, third):
     fitter, fit = without_effects(with_added(simulate(scenario("lawnmower", seconds=300.0, gnss_std=0.03)), third))
     rest = find_unexplained(fitter, fit)
     assert rest.about == about
-    assert is_predictive(fitter.problem, fit, rest)
+    assert rest.found
 
 
 def test_a_magnetic_anomaly_is_a_passage_that_turns_the_heading():
@@ -269,4 +265,4 @@ def test_a_magnetic_anomaly_is_a_passage_that_turns_the_heading():
     fitter, fit = without_effects(with_added(run, turned))
     rest = find_unexplained(fitter, fit)
     assert rest.about == "a passage that turns the heading"
-    assert is_predictive(fitter.problem, fit, rest)
+    assert rest.found
