@@ -18,16 +18,11 @@ from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis, Values
 from ..model.recorded_streams import RecordedStreams
 from ..model.stream_curve import Curve
+from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, DVL_CLOCK
 from ..search.effect_selection import EffectSelection
 from .simulated_twin import simulated, with_denoised_reference
 
 Three = tuple[float, float, float]
-# Parameters of effects that the calibration may already correct; the estimate is added
-_KNOWN_BEFORE = {
-    "lever_arm": ("x_m", "y_m", "z_m"),
-    "dvl_time_offset": ("seconds",),
-    "clock_drift": ("seconds_per_hour",),
-}
 
 
 @dataclass(frozen=True)
@@ -89,17 +84,16 @@ def _with_configured(selection: EffectSelection, parameters: Parameters) -> Hypo
     hypothesis = selection.fit.hypothesis
     n = len(selection.fitter.problem.recordings)
     before = {
-        "lever_arm": parameters.lever_arm,
-        "dvl_time_offset": (parameters.dvl_time_offset,),
-        "clock_drift": (3600.0 * parameters.dvl_clock_drift,),
+        ARM: dict(zip(ARM_PARAMETERS, parameters.lever_arm, strict=True)),
+        DVL_CLOCK: {"seconds": parameters.dvl_time_offset},
+        "clock_drift": {"seconds_per_hour": 3600.0 * parameters.dvl_clock_drift},
     }
     values: dict[str, tuple[Values, ...]] = {}
     for name, known in before.items():
-        if not any(known) or not EFFECTS[name].needs <= selection.fitter.problem.available:
+        if not any(known.values()) or not EFFECTS[name].needs <= selection.fitter.problem.available:
             continue
         found = hypothesis.values.get(name) or (EFFECTS[name].defaults,) * n
-        names = dict(zip(_KNOWN_BEFORE[name], known, strict=True))
-        values[name] = tuple({**each, **{key: each[key] + names[key] for key in names}} for each in found)
+        values[name] = tuple({**each, **{key: each.get(key, 0.0) + known[key] for key in known}} for each in found)
     added = [EFFECTS[name] for name in values if EFFECTS[name] not in hypothesis.effects]
     return hypothesis.with_effects([*hypothesis.effects, *added], n, values)
 

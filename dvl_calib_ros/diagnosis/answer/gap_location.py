@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,7 @@ def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[GapPlace
             ]
     adjusted = holm([place.p for place in found])
     kept = [
-        GapPlace(place.axis, place.regime, place.segment_s, place.band_hz, place.share, float(p))
+        replace(place, p=float(p))
         for place, p in zip(found, adjusted, strict=True)
         if p < SETTINGS.level and place.share > 0.02
     ]

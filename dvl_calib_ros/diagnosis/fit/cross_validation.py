@@ -56,23 +56,16 @@ def held_out_deviance(problem: Problem, noise: Noise, fitted: NuisanceFit, resid
     It accounts for the columns' uncertainty: if the only dive of a run is held out, no other stretch determines an
     effect of the pitch, and the prediction is correspondingly uncertain.
     """
-    folds = list(_held_out(problem, noise, fitted, residual))
-    held, trained = folds[0]
-    whole = replace(held, gram=held.gram + trained.gram).marginal_deviance()
-    return sum(whole - trained.marginal_deviance() for _, trained in folds)
-
-
-def _held_out(
-    problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array
-) -> Iterator[tuple[WhitenedLeastSquares, WhitenedLeastSquares]]:
-    """Yield per fold the least squares systems of the held-out and of the training stretches."""
     white, series = noise.whiten(fitted.columns), noise.whiten(residual)
     rows = np.repeat(stretch_of(problem.time) % SETTINGS.folds, residual.shape[1])
     parts = [(white[rows == fold], series[rows == fold]) for fold in np.unique(rows)]
-    each = [WhitenedLeastSquares.of(*part, fitted.std, fitted.centre) for part in parts]
-    for held in each:
-        trained = sum((other.gram for other in each if other is not held), start=np.zeros_like(held.gram))
-        yield held, replace(held, gram=trained)
+    systems = [WhitenedLeastSquares.of(*part, fitted.std, fitted.centre) for part in parts]
+    grams = np.stack([each.gram for each in systems])
+    whole, *trained = (
+        replace(systems[0], gram=grams[kept].sum(axis=0)).marginal_deviance()
+        for kept in (np.ones(len(grams), dtype=bool), *~np.eye(len(grams), dtype=bool))
+    )
+    return sum(whole - each for each in trained)
 
 
 def predictive_gain(problem: Problem, simpler: SlowNoiseOfFit, richer: SlowNoiseOfFit) -> float:
