@@ -26,7 +26,7 @@ from .answer.plotted_series import collect_series
 from .answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
 from .answer.simulated_twin import twins
 from .fit.gauss_newton import around, prior_std
-from .model.hypothesis import amplitudes, is_time_of_run
+from .model.hypothesis import amplitudes
 from .model.recorded_streams import RecordedStreams, load_recordings
 from .model.settings import SETTINGS
 from .noise.whitened_least_squares import WhitenedLeastSquares
@@ -251,17 +251,15 @@ def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: in
     fit, problem = selection.fit, selection.fitter.problem
     columns = [fit.columns]
     std = [prior_std(fit.hypothesis)]
-    names = [each.name for each in fit.effects]
-    if effect.name in names:
-        at = 6 + sum(len(fit.hypothesis.parameters_of(e)) for e in fit.effects[: names.index(effect.name)])
-    else:
-        at = fit.columns.shape[2]
+    at = fit.hypothesis.indices_of(effect.name)
+    if not len(at):
         columns.append(problem.columns(fit.hypothesis, fit.seen, effect, default_values(effect, problem)))
         std.append(np.full(columns[-1].shape[2], 1e6))
+        at = len(std[0]) + np.arange(len(std[1]))
     white = fit.noise.whiten(np.concatenate(columns, axis=2))
     prior = np.concatenate(std)
     system = WhitenedLeastSquares.of(white, np.zeros(len(white)), prior, np.zeros(len(prior)))
-    own = np.sqrt(np.maximum(np.diag(system.covariance()), 0.0))[at:]
+    own = np.sqrt(np.maximum(np.diag(system.covariance())[at], 0.0))
     factor = float(normal_isf(SETTINGS.level / n_tested / 2.0) + normal_isf(1.0 - POWER))
     return {spec.name: factor * float(each) for spec, each in zip(amplitudes(effect), own, strict=False)}
 
@@ -282,18 +280,14 @@ def _found_effect(
 ) -> FoundEffect:
     """Return a selected effect with intervals of its sizes and times."""
     fit, effect = selection.fit, selected.effect
-    stds = np.sqrt(np.diag(covariance))[6:].tolist()
-    by_recording: dict[int, dict[str, Triple]] = {}
-    for parameter, std in zip(fit.hypothesis.parameters(), stds, strict=True):
-        if parameter.effect is effect:
-            of_recording = by_recording.setdefault(parameter.recording or 0, {})
-            of_recording[parameter.spec.name] = around(fit.hypothesis.value(parameter), std)
-    for recording, parameters in by_recording.items():
-        for spec in filter(is_time_of_run, effect.parameters):
-            parameters[spec.name] = times[effect.name, recording, spec.name]
+    stds = np.sqrt(np.diag(covariance))[fit.hypothesis.indices_of(effect.name)].tolist()
+    known = times | {
+        (effect.name, each.recording or 0, each.spec.name): around(fit.hypothesis.value(each), std)
+        for each, std in zip(fit.hypothesis.parameters_of(effect), stds, strict=True)
+    }
     ordered = {
-        recording: {spec.name: parameters[spec.name] for spec in effect.parameters}
-        for recording, parameters in by_recording.items()
+        recording: {spec.name: known[effect.name, recording, spec.name] for spec in effect.parameters}
+        for recording in dict.fromkeys(each.recording or 0 for each in fit.hypothesis.parameters_of(effect))
     }
     names = [recording.name for recording in selection.fitter.problem.recordings]
     together = _weighted_mean(list(ordered.values())) if len(ordered) > 1 else next(iter(ordered.values()))

@@ -169,7 +169,7 @@ def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
     start: dict[str, tuple[Values, ...]] = {
         effect.name: tuple(default_values(effect, fitter.problem)) for effect in chosen if effect.name not in found
     }
-    return fitter.fit(fit.hypothesis.with_effects(chosen, len(fit.seen), start), fit.noise)
+    return fitter.fit(fit.hypothesis.with_effects(chosen, fit.n_recordings, start), fit.noise)
 
 
 def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
@@ -178,7 +178,7 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
     covariance = fit.covariance(block)
     dof = int(block.max()) + 1
     vector = fit.hypothesis.vector()
-    n_all = len(fit.seen)
+    n_all = fit.n_recordings
     result, first = {}, 6
     for effect in fit.effects:
         owners = whose_parameters(effect, n_all)
@@ -196,7 +196,7 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
 def trace_of(selection: EffectSelection, fit: Fit, effect: Effect) -> Array:
     """Return (M, A) m/s that an effect adds, without the part absorbed by misalignment, scale and other effects."""
     others = [other for other in fit.effects if other is not effect]
-    without = selection.fitter.fit(fit.hypothesis.with_effects(others, len(fit.seen), {}), fit.noise, 4)
+    without = selection.fitter.fit(fit.hypothesis.with_effects(others, fit.n_recordings, {}), fit.noise, 4)
     return without.residual - fit.residual
 
 

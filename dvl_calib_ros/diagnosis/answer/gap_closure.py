@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_over, ends_of_stretches, integration_steps
 from ...calibration.numerics.frames import Array
-from ..fit.cross_validation import fitted_without, folds_of, stretch_of
+from ..fit.cross_validation import fitted_without, folds_of
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.selection_criteria import SlowNoiseOfFit, blocks_of
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
+from ..noise.noise_level import stretches_of
 from ..search.effect_selection import EffectSelection
 from ..search.unexplained import Unexplained
 
@@ -115,20 +116,14 @@ def held_out(selection: EffectSelection, unexplained: Unexplained) -> HeldOutRes
             else:
                 into[at] = problem.errors(fitted.seen)[at]
         left_open[at] = _undetermined(each[-1])[problem.bin_of][at]
-    block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
-    return HeldOutResiduals(
-        before,
-        after,
-        noise_floor(selection, unexplained),
-        np.asarray(block, dtype=np.intp),
-        left_open,
-    )
+    block = stretches_of(problem)[problem.bin_of]
+    return HeldOutResiduals(before, after, noise_floor(selection, unexplained), block, left_open)
 
 
 def _undetermined(fit: Fit) -> Array:
     """Return the predicted error variance (M,), (m/s)², of a fit per bin. Parameters per recording do not contribute:
     they are fitted to the held-out recording."""
-    of_day = [each.effect.per_recording and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
+    of_day = [each.effect.per_recording and fit.n_recordings > 1 for each in fit.hypothesis.parameters()]
     return np.asarray(_error_variance(fit, np.flatnonzero(~np.array([False] * 6 + of_day))).sum(axis=1))
 
 
@@ -259,7 +254,7 @@ def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
     chosen = [effect for effect in fit.effects if effect.name == name]
     if len(fit.effects) == 1 or not np.isfinite(gap.closure):
         return gap.closure
-    alone = fitter.fit_kept(fit.hypothesis.with_effects(chosen, len(fit.seen), {}), fit.noise)
+    alone = fitter.fit_kept(fit.hypothesis.with_effects(chosen, fit.n_recordings, {}), fit.noise)
     without, with_it = (
         float(np.mean((fitter.problem.errors(each.seen) ** 2).sum(axis=1))) for each in (selection.base, alone)
     )
@@ -327,12 +322,3 @@ def reported_std(problem: Problem) -> list[Array] | None:
 def _reported(problem: Problem) -> float | None:
     reported = reported_std(problem)
     return None if reported is None else float(np.sqrt(np.mean([np.sum(each**2) for each in reported])))
-
-
-# ------------------------------------------------------------------ folds
-
-
-def _block_keys(problem: Problem) -> Integers:
-    index = stretch_of(problem.time)
-    index -= index.min()
-    return np.asarray(problem.recording_of * (index.max() + 1) + index, dtype=np.intp)

@@ -12,7 +12,6 @@ from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.tests import holm
 from ..fit.gauss_newton import Z_INTERVAL, Fit, Fitter, around
-from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..model.claimed_noise import relative_std
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
@@ -53,11 +52,7 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
     if not found:
         return []
     adjusted = holm([each.p for each in found])
-    findings = [
-        NoiseFinding(each.name, each.parameters, float(p))
-        for each, p in zip(found, adjusted, strict=True)
-        if p < SETTINGS.level
-    ]
+    findings = [replace(each, p=float(p)) for each, p in zip(found, adjusted, strict=True) if p < SETTINGS.level]
     return sorted(findings, key=lambda each: each.p)
 
 
@@ -70,20 +65,20 @@ def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
     spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
     if spikes > count:
         count, n = spikes, received
-    if count < 3:
-        return None
-    p = binomial_sf(count, n, 6.0 * float(normal_sf(SETTINGS.outlying)))
-    return NoiseFinding("outliers", {"share": (count / n, *binomial_interval(count, n))}, p)
+    return _share("outliers", count, n, 6.0 * float(normal_sf(SETTINGS.outlying)))
 
 
 def _stale(problem: Problem) -> NoiseFinding | None:
     """Test whether repeated velocities are more frequent than chance explains."""
-    count = sum(recording.repeats for recording in problem.recordings)
-    n = sum(recording.received for recording in problem.recordings)
+    count, n = (sum(getattr(each, name) for each in problem.recordings) for name in ("repeats", "received"))
+    return _share("stale_samples", count, n, CHANCE_OF_REPEAT)
+
+
+def _share(name: str, count: int, n: int, chance: float) -> NoiseFinding | None:
+    """Test a share of samples against the share by chance; one or two samples are no finding."""
     if count < 3:
         return None
-    p = binomial_sf(count, n, CHANCE_OF_REPEAT)
-    return NoiseFinding("stale_samples", {"share": (count / n, *binomial_interval(count, n))}, p)
+    return NoiseFinding(name, {"share": (count / n, *binomial_interval(count, n))}, binomial_sf(count, n, chance))
 
 
 def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
@@ -106,24 +101,18 @@ def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
 
 
 def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
-    """Return the noise with the colour that interpolation gives to white noise.
+    """Return the noise with the colour that interpolation gives to the white noise of both streams, by simulation.
 
     A stream that is `denoised` between its samples retains only low frequencies of its noise, as slow as the vehicle's
-    motion.
+    motion. The residual's excess over the streams' noise is white.
     """
-    noise, white = fit.noise, replace(fit, noise=fit.noise.white)
-    residuals = [residual for _, _, residual in simulated_recordings(problem, white, SIMULATED // 2)]
-    m = len(fit.residual)
-    pooled = replace(
-        noise,
-        segments=tuple(
-            slice(part.start + k * m, part.stop + k * m) for k in range(len(residuals)) for part in noise.segments
-        ),
-        rotation=None if noise.rotation is None else np.concatenate([noise.rotation] * len(residuals)),
-        level=np.concatenate([noise.level] * len(residuals)),
-    ).like(np.concatenate(residuals))
-    unit = replace(noise, axes=tuple(replace(arma, std=1.0) for arma in pooled.axes))
-    stds = np.sqrt((unit.whiten(fit.residual).reshape(fit.residual.shape) ** 2).mean(axis=0)).tolist()
+    noise, residual, rng = fit.noise, fit.residual, np.random.default_rng(0)
+    noisy = problem.with_noise(rng, dvl=True, reference=True)
+    simulated = noisy.residual(noisy.all_seen(fit.hypothesis)) - problem.residual(fit.seen)
+    target, achieved = (float(np.mean(noise.white.whiten(each) ** 2)) for each in (residual, simulated))
+    simulated += np.sqrt(max(target - achieved, 0.0)) * noise.white.unwhiten(rng.standard_normal(residual.size))
+    unit = replace(noise, axes=tuple(replace(arma, std=1.0) for arma in noise.like(simulated).axes))
+    stds = np.sqrt((unit.whiten(residual).reshape(residual.shape) ** 2).mean(axis=0)).tolist()
     return replace(unit, axes=tuple(replace(arma, std=std) for arma, std in zip(unit.axes, stds, strict=True)))
 
 

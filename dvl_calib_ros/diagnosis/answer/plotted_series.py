@@ -118,7 +118,7 @@ def collect_series(
 ) -> DiagnosisSeries:
     """Collect the series of a selection and its residual. covariance: (6 + p, 6 + p) of the fit."""
     fitter, fit = selection.fitter, selection.fit
-    problem, n = fitter.problem, len(fit.seen)
+    problem, n = fitter.problem, fit.n_recordings
     errors = problem.errors(fit.seen)
     traces = {}
     for effect in fit.effects:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...effects.base import Effect
-from ..model.forward_model import LazySeen, Problem
+from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, whose_parameters
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
@@ -55,16 +55,15 @@ def prior_std(hypothesis: Hypothesis) -> Array:
 
 @dataclass(frozen=True)
 class Fit:
-    """Fitted hypothesis. seen: per recording. residual: (M, A) m/s, winsorised. made: evaluates `columns`. system: of
-    the last step. own_noise: whitened residual from simulated noise of the velocities. deviance: whitened squares and
-    prior, minus the squares of own_noise: a delay changes the interpolation phase and a low-pass smooths noise, neither
-    of which is evidence. of_tails: additional squares of own_noise if its tails are heavier than simulated."""
+    """Fitted hypothesis. residual: (M, A) m/s, winsorised. system: of the last step. own_noise: whitened residual from
+    simulated noise of the velocities. deviance: whitened squares and prior, minus the squares of own_noise: a delay
+    changes the interpolation phase and a low-pass smooths noise, neither of which is evidence. of_tails: additional
+    squares of own_noise if its tails are heavier than simulated."""
 
+    problem: Problem
     hypothesis: Hypothesis
-    seen: Sequence[Seen]
     residual: Array
     noise: Noise
-    made: Callable[[], Array] = field(repr=False)
     system: WhitenedLeastSquares
     deviance: float
     own_noise: Array
@@ -72,10 +71,20 @@ class Fit:
     # results of tests of this fit, by name, each computed once
     kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
+    @property
+    def n_recordings(self) -> int:
+        """Return the number of recordings."""
+        return len(self.problem.recordings)
+
+    @cached_property
+    def seen(self) -> list[Seen]:
+        """Return the evaluation per recording, on demand: it is large, and most fits never need it."""
+        return self.problem.all_seen(self.hypothesis)
+
     @cached_property
     def columns(self) -> Array:
         """Return derivatives of the residual, (M, A, 6 + p), on demand."""
-        return self.made()
+        return self.problem.all_columns(self.hypothesis, self.seen)
 
     def gain_over(self, reduced: Fit) -> float:
         """Return the lower bound of the deviance gain over another fit.
@@ -203,18 +212,16 @@ class Fitter:
         """
         is_fixed = np.array([True] * 6 + [not each.effect.per_recording for each in start.parameters()]) & only_own
         is_fixed |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
-        hypothesis = start
+        free, hypothesis = np.flatnonzero(~is_fixed), start
         if linearised is not None:
             evaluated = linearised.seen, linearised.residual
         seen, residual = evaluated or self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
         for _ in range(max_steps):
             linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
-            system = linearised.system
-            free = np.flatnonzero(~is_fixed)
             step = np.zeros(len(is_fixed))
-            step[free] = system.part(free).solution() if len(free) else 0.0
-            if misfit - system.misfit(step) < CONVERGED_GAIN:
+            step[free] = linearised.system.part(free).solution()
+            if misfit - linearised.system.misfit(step) < CONVERGED_GAIN:
                 break
             improved, trial_step = False, step
             for _ in range(HALVINGS):
@@ -230,43 +237,35 @@ class Fitter:
             linearised = None
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
         linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
-        columns, plain = linearised.columns, linearised.system
-        made: Callable[[], Array] = partial(np.asarray, columns)
-        system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
-        free = np.flatnonzero(~is_fixed)
-        if len(free):
-            step = np.zeros(len(is_fixed))
-            step[free] = system.part(free).solution()
-            last = hypothesis.moved(step)
-            last_seen, last_residual = self.evaluated(last)
-            last_misfit = self._misfit(noise, last_residual, last)
-            if last_misfit < MAX_MISFIT_INCREASE * misfit:
-                hypothesis, seen, residual, misfit = last, last_seen, last_residual, last_misfit
-                made = partial(self.problem.all_columns, hypothesis, seen)
+        system = self._without_own_noise(linearised, hypothesis, noise)
+        step = np.zeros(len(is_fixed))
+        step[free] = system.part(free).solution()
+        last = hypothesis.moved(step)
+        last_residual = self.evaluated(last)[1]
+        last_misfit = self._misfit(noise, last_residual, last)
+        if last_misfit < MAX_MISFIT_INCREASE * misfit:
+            hypothesis, residual, misfit = last, last_residual, last_misfit
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
         of_each = own_noise.reshape(len(self.problem.perturbed), -1)
         of_tails = float((np.array(self.problem.noise_excess) - 1.0) @ (of_each**2).sum(axis=1))
-        return Fit(hypothesis, seen, residual, noise, made, system, deviance, own_noise, of_tails)
+        return Fit(self.problem, hypothesis, residual, noise, system, deviance, own_noise, of_tails)
 
-    def _without_own_noise(
-        self, system: WhitenedLeastSquares, hypothesis: Hypothesis, noise: Noise, columns: Array, residual: Array
-    ) -> WhitenedLeastSquares:
-        """Subtract from a system the contribution of the velocities' own noise, from simulated noise.
+    def _without_own_noise(self, at: _Linearisation, hypothesis: Hypothesis, noise: Noise) -> WhitenedLeastSquares:
+        """Subtract from a linearisation's system the contribution of the velocities' own noise, which is simulated.
 
         The columns of scale and misalignment contain the same noise as the residual, so scale would fit noise (errors
         in variables).
         """
-        gram = system.gram
+        gram = at.system.gram
         for perturbed in self.problem.perturbed:
             seen = perturbed.all_seen(hypothesis)
-            fitter = replace(self, problem=perturbed, _fits={})
-            white = self._whiten(noise, fitter.columns(hypothesis, seen) - columns)
-            noise_part = self._whiten(noise, perturbed.residual(seen) - residual - self.outliers)
+            white = self._whiten(noise, perturbed.all_columns(hypothesis, seen) - at.columns)
+            noise_part = self._whiten(noise, perturbed.residual(seen) - at.residual - self.outliers)
             joined = np.column_stack([white, -noise_part])
             gram = gram - joined.T @ joined
-        corrected = replace(system, gram=gram)
-        return corrected if corrected.is_definite else system
+        corrected = replace(at.system, gram=gram)
+        return corrected if corrected.is_definite else at.system
 
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """Return the whitened contribution (S n,) of S simulations of velocity noise to a residual of n values."""
@@ -300,10 +299,7 @@ class Fitter:
                 other = self.evaluated(each)
                 if self._misfit(noise, other[1], each) < self._misfit(noise, evaluated[1], nearest):
                     nearest, evaluated = each, other
-            fit = self.fit(nearest, noise, evaluated=evaluated)
-            seen = LazySeen(self.problem, fit.hypothesis)
-            columns = partial(self.problem.all_columns, fit.hypothesis, seen)
-            self._fits[key] = replace(fit, seen=seen, made=columns)
+            self._fits[key] = self.fit(nearest, noise, evaluated=evaluated)
             self.problem.fitted[model] = [self._fits[key].hypothesis]
         return self._fits[key]
 

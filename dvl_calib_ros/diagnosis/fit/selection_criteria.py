@@ -52,7 +52,7 @@ def penalty(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.
 
 def criterion(fit: Fit, n_effects: int) -> float:
     """Return the deviance plus the price of every effect."""
-    n = len(fit.seen)
+    n = fit.n_recordings
     return fit.deviance + sum(penalty(effect, n_effects, n, times_tried(effect)) for effect in fit.effects)
 
 
@@ -75,7 +75,7 @@ def best_of(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
 def fit_without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
     """Fit without one of the effects, under the same noise."""
     rest = [other for other in fit.effects if other is not effect]
-    return fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
+    return fitter.fit_kept(fit.hypothesis.with_effects(rest, fit.n_recordings, {}), fit.noise)
 
 
 def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
@@ -104,12 +104,7 @@ def robust_p(fit: Fit, effect: Effect, covariance: Array, blocks: int) -> float:
 
     covariance: (6 + p, 6 + p), from a number of blocks.
     """
-    at, start = np.zeros(0, dtype=int), 6
-    for other in fit.effects:
-        p = len(fit.hypothesis.parameters_of(other))
-        if other is effect:
-            at = np.arange(start, start + p)
-        start += p
+    at = fit.hypothesis.indices_of(effect.name)
     defaults = np.array([each.spec.default for each in fit.hypothesis.parameters_of(effect)])
     values = fit.hypothesis.vector()[at] - defaults
     wald = float(values @ np.linalg.solve(covariance[np.ix_(at, at)], values)) / len(at)

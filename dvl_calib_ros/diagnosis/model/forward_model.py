@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,27 +70,6 @@ class _Moved(NamedTuple):
     body_from_measured: Array
     dvl_stamps: Array
     attitude_stamps: Array
-
-
-class LazySeen(Sequence[Seen]):
-    """Lazy evaluation of a hypothesis: for hours of data it is large, and most fits never need it."""
-
-    def __init__(self, problem: Problem, hypothesis: Hypothesis) -> None:
-        self._problem, self._hypothesis = problem, hypothesis
-
-    @cached_property
-    def _evaluated(self) -> list[Seen]:
-        return self._problem.all_seen(self._hypothesis)
-
-    def __len__(self) -> int:
-        return len(self._problem.recordings)
-
-    @overload
-    def __getitem__(self, at: int) -> Seen: ...
-    @overload
-    def __getitem__(self, at: slice) -> Sequence[Seen]: ...
-    def __getitem__(self, at: int | slice) -> Seen | Sequence[Seen]:
-        return self._evaluated[at]
 
 
 @dataclass(frozen=True)
@@ -210,11 +189,21 @@ class Problem:
         The reference is omitted if the grid uses its own samples: its noise then is the same for all hypotheses.
         """
         rng = np.random.default_rng(0)
-        dvl = [replace(one, dvl=one.dvl.perturbed(rng)) for one in self.recordings]
-        reference = [replace(one, reference=one.reference.perturbed(rng)) for one in self.recordings]
+        of_dvl, of_reference = self.with_noise(rng, dvl=True), self.with_noise(rng, reference=True)
         by_dvl = any(grid.clock is ActsOn.DVL_CLOCK for grid in self.grids)
-        each = [dvl, reference] if by_dvl else [dvl]
-        return tuple(replace(self, recordings=tuple(recordings)) for recordings in each)
+        return (of_dvl, of_reference) if by_dvl else (of_dvl,)
+
+    def with_noise(self, rng: np.random.Generator, *, dvl: bool = False, reference: bool = False) -> Problem:
+        """Return the problem with additional simulated noise in the named velocities."""
+        recordings = (
+            replace(
+                one,
+                dvl=one.dvl.perturbed(rng) if dvl else one.dvl,
+                reference=one.reference.perturbed(rng) if reference else one.reference,
+            )
+            for one in self.recordings
+        )
+        return replace(self, recordings=tuple(recordings))
 
     @cached_property
     def noise_excess(self) -> tuple[float, ...]:
@@ -468,14 +457,6 @@ class Problem:
         turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
         slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
         return [turned, self._columns_per_recording(effect, slower)]
-
-    def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
-        """Return (M, A) m/s that an effect adds to the residual of a hypothesis without it."""
-        without = [other for other in hypothesis.effects if other is not effect]
-        n = len(self.recordings)
-        plain = hypothesis.with_effects(without, n, {})
-        with_it = plain.with_effects([*without, effect], n, {effect.name: tuple(values)})
-        return self.residual(self.all_seen(plain)) - self.residual(self.all_seen(with_it))
 
     def _derivatives(self, hypothesis: Hypothesis, seen: Seen, effect: Effect, values: Values) -> Array:
         """Return d e / d parameters of an effect, (F, 3, p), body frame."""

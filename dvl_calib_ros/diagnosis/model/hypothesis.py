@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...calibration.numerics.frames import Array
@@ -74,6 +75,10 @@ class Hypothesis:
         each = self.values[effect.name]
         whose = whose_parameters(effect, len(each))
         return [Parameter(effect, spec, recording) for recording in whose for spec in amplitudes(effect)]
+
+    def indices_of(self, name: str) -> NDArray[np.intp]:
+        """Return the indices in `vector` of the parameters of an effect."""
+        return 6 + np.flatnonzero([each.effect.name == name for each in self.parameters()])
 
     def value(self, parameter: Parameter) -> float:
         """Return the value of a parameter."""

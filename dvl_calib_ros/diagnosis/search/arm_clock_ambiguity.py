@@ -56,7 +56,7 @@ def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, t
     To first order a low-pass is a delay. For seconds, linear steps do not lead from one to the other.
     """
     own = [fit.values.get(LAG, ()), fit.values.get(REFERENCE_CLOCK, ())]
-    each = [[next(iter(values.values())) for values in per] or [0.0] * len(fit.seen) for per in own]
+    each = [[next(iter(values.values())) for values in per] or [0.0] * fit.n_recordings for per in own]
     delays = [lag + delay for lag, delay in zip(*each, strict=True)]
     if min(delays) < LAG_FROM_S or not any(own):
         return []
@@ -140,7 +140,7 @@ def with_clocks(
     clocks = [effects[name] for name in TWO_CLOCKS if name in effects and name not in present]
     if ARM not in present or not clocks or not is_open(guesses):
         return fit
-    joint = fitter.fit_kept(fit.hypothesis.with_effects([*fit.effects, *clocks], len(fit.seen), {}), fit.noise)
+    joint = fitter.fit_kept(fit.hypothesis.with_effects([*fit.effects, *clocks], fit.n_recordings, {}), fit.noise)
     if trade_off is not None and joint.deviance > fit.deviance + SETTINGS.indistinguishable:
         return None
     (own, own_std), (free, free_std) = (_arm_of(each, block) for each in (fit, joint))
@@ -213,7 +213,7 @@ def with_ambiguity(fit: Fit, covariance: Array, trade_off: ArmAmbiguity | None) 
 def ambiguous_combination(fit: Fit, covariance: Array, trade_off: ArmAmbiguity | None) -> Combination | None:
     """Return the observable combination of arm and reference clock from a fit of one recording without that clock."""
     at = _indices(fit, ARM)
-    if trade_off is None or not at or len(fit.seen) > 1:
+    if trade_off is None or not at or fit.n_recordings > 1:
         return None
     name = max(at, key=lambda each: abs(trade_off.by[each]))
     value, std = float(fit.hypothesis.vector()[at[name]]), float(np.sqrt(covariance[at[name], at[name]]))
@@ -223,7 +223,7 @@ def ambiguous_combination(fit: Fit, covariance: Array, trade_off: ArmAmbiguity |
 def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
     """Return the observable combination of arm and clock of one recording from their covariance (6 + p, 6 + p)."""
     arm, delay = _indices(fit, ARM), _indices(fit, clock).get("seconds")
-    if delay is None or not arm or len(fit.seen) > 1:
+    if delay is None or not arm or fit.n_recordings > 1:
         return None
     vector = fit.hypothesis.vector()
     speeds = {name: float(covariance[i, delay] / covariance[delay, delay]) for name, i in arm.items()}

@@ -43,7 +43,7 @@ def without_chance(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     An effect is kept if the covariance of its interval makes it significant, and it predicts held-out data beyond its
     price.
     """
-    problem, n = fitter.problem, len(fit.seen)
+    problem, n = fitter.problem, fit.n_recordings
     while fit.effects:
         covariance = robust_covariance(problem, fit)
         p_values = {effect.name: robust_p(fit, effect, *covariance) for effect in fit.effects}
@@ -81,7 +81,7 @@ def repeated_effects(
         if double.again.keys() <= best.values[name][0].keys():
             starts = single_occurrences(best, effects[name], double)
         else:
-            n = len(best.seen)
+            n = best.n_recordings
             once, twice = (penalty(each, len(effects), n, times_tried(each)) for each in (effects[name], double))
             limit = best.deviance + once - twice
             starts = _second_occurrences(fitter, best, double, limit)

@@ -134,9 +134,9 @@ def _combinations(
     return table, to_fit
 
 
-def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
+def variants_about(fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
     """Return the columns about a fit of every effect that it lacks, at every window."""
-    problem, present = fitter.problem, {effect.name for effect in fit.effects}
+    problem, present = fit.problem, {effect.name for effect in fit.effects}
     n = len(problem.recordings)
     seconds = max(recording.seconds for recording in problem.recordings)
     found = []
@@ -155,13 +155,11 @@ def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> l
 def linearised(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> LinearisedModel:
     """Linearise the effects of a fit, in its order, and then every other effect at every window."""
     problem, noise, hypothesis = fitter.problem, fit.noise, fit.hypothesis
-    own: list[Variant] = []
-    at = 6
-    for effect in fit.effects:
-        p = len(hypothesis.parameters_of(effect))
-        own.append(Variant(effect, hypothesis.values[effect.name], fit.columns[:, :, at : at + p], 1.0))
-        at += p
-    variants = [*own, *variants_about(fitter, fit, effects)]
+    own = [
+        Variant(each, fit.values[each.name], fit.columns[:, :, hypothesis.indices_of(each.name)], 1.0)
+        for each in fit.effects
+    ]
+    variants = [*own, *variants_about(fit, effects)]
     # linear prediction of the residual without the fit's effects
     vector = hypothesis.vector()
     defaults = [0.0] * 6 + [each.spec.default for each in hypothesis.parameters()]
@@ -270,7 +268,7 @@ def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> 
 
     A clock jump at the beginning is a constant DVL delay.
     """
-    n, values = len(fit.seen), fit.values
+    n, values = fit.n_recordings, fit.values
     clocks = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
     if not set(clocks) & set(values):
         return []
@@ -312,7 +310,7 @@ def _with_lag_or_delay(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothes
     """Return the fit with a lag of the reference for its delay, or a delay for its lag."""
     others = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
     return [
-        fit.hypothesis.with_effects([*others, *(effects[name] for name in start)], len(fit.seen), start)
+        fit.hypothesis.with_effects([*others, *(effects[name] for name in start)], fit.n_recordings, start)
         for start in lags_and_delays(fit, effects)
     ]
 

@@ -52,7 +52,7 @@ def hypotheses_with_jumps(
     once, every: effects with one and with two jumps. Empty if the fit has no effect of time.
     """
     present = {effect.name for effect in fit.effects}
-    if len(fit.seen) > 1 or LEAP not in single or not present & {*OF_TIME}:
+    if fit.n_recordings > 1 or LEAP not in single or not present & {*OF_TIME}:
         return []
     kept = [effect for effect in fit.effects if effect.name not in STANDS_IN]
     squares, ends = _squares(fitter, fit, kept, every[DVL_CLOCK])
@@ -74,7 +74,7 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     Backward clock steps have a negative excess, an upper bound of their size. A forward clock jump leaves a gap of its
     own size; lost samples leave gaps as well.
     """
-    if len(fit.seen) > 1:
+    if fit.n_recordings > 1:
         return []
     (recording,) = fitter.problem.recordings
     stamps = recording.dvl.time

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,7 +186,7 @@ def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
 def with_noise_reestimated(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit]:
     """Repeat a fit with noise and outliers re-estimated from the residual of all columns jointly."""
     problem = fitter.problem
-    columns = _columns_of_all_effects(fitter, fit, effects)
+    columns = _columns_of_all_effects(fit, effects)
     noise = fit.noise
     raw = fit.residual + fitter.outliers
     size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
@@ -208,18 +207,17 @@ def with_noise_reestimated(fitter: Fitter, fit: Fit, effects: Mapping[str, Effec
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
-def _columns_of_all_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Array:
+def _columns_of_all_effects(fit: Fit, effects: Mapping[str, Effect]) -> Array:
     """Return columns (M, A, p) of a fit and of all effects without a time of the run."""
     others = {name: effect for name, effect in effects.items() if not any(map(is_time_of_run, effect.parameters))}
-    return np.concatenate([fit.columns, *(each.columns for each in variants_about(fitter, fit, others))], axis=2)
+    return np.concatenate([fit.columns, *(each.columns for each in variants_about(fit, others))], axis=2)
 
 
 def _with_simulated_noise(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
     """Yield the same columns (M, A, p) and residual (M, A) with simulated noise in each velocity in turn."""
     for problem in fitter.problem.perturbed:
-        other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
-        perturbed = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
-        yield _columns_of_all_effects(other, perturbed, effects), problem.residual(seen)
+        perturbed = replace(fit, problem=problem)
+        yield _columns_of_all_effects(perturbed, effects), problem.residual(perturbed.seen)
 
 
 def _frames(problem: Problem) -> list[Array | None]:
@@ -270,7 +268,7 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
     Its parameters are shared or per recording. A fit without such effects gets only promising proposals, a single
     recording none. heading: with all its parameters; None if untestable.
     """
-    if heading is None or len(fit.seen) < 2:
+    if heading is None or fit.n_recordings < 2:
         return []
     found = [_with_heading_instead(fit, BY_YAW, each) for each in _two_cycles(heading)]
     if BY_YAW & fit.values.keys():
@@ -281,7 +279,7 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
 
 def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit, dict[str, str]]:
     """Replace a moving mounting by an equally good heading error. Return the fit and equivalents by effect name."""
-    if heading is None or len(fit.seen) < 2:
+    if heading is None or fit.n_recordings < 2:
         return fit, {}
     equivalent: dict[str, str] = {}
     if DRIFT in fit.values:
@@ -315,7 +313,7 @@ def _names(effect: Effect) -> frozenset[str]:
 
 def _with_heading_instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
     """Return the hypothesis of a fit with a heading error in place of the named effects."""
-    n = len(fit.seen)
+    n = fit.n_recordings
     none = {name: value for name, value in heading.defaults.items() if name in _names(heading)}
     own: tuple[Values, ...] = fit.values.get(HEADING, (none,) * n)
     start = tuple({name: each.get(name, value) for name, value in none.items()} for each in own)

@@ -108,7 +108,7 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     log_p = log_p_in_place(fitter, fit, reduced, effect)
     drop = reduced.deviance - fit.deviance
     table = linearised(fitter, reduced, effects)
-    n = len(fit.seen)
+    n = fit.n_recordings
     own = list(range(len(reduced.effects)))
     found: list[tuple[float, str, Hypothesis]] = []
     best_by_name: dict[str, int] = {}
@@ -169,7 +169,7 @@ def _clock_or_arm(
         return [each for each in selected if each is not arm]
     kept, other = (arm, clock) if passes(arm) else (clock, arm)
     remaining = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
-    without = fitter.fit_kept(fit.hypothesis.with_effects(remaining, len(fit.seen), {}), fit.noise)
+    without = fitter.fit_kept(fit.hypothesis.with_effects(remaining, fit.n_recordings, {}), fit.noise)
     log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
     equivalent = dict.fromkeys((other.effect.name, *kept.equivalent))
     return [Selected(kept.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (kept, other))]

@@ -145,7 +145,7 @@ def test_what_comes_and_goes_does_so_at_another_time_by_another_clock():
     values |= {"water_lock": (lock,), "time_offset_jump": (always,)}
     effects = {name: EFFECTS[name].once for name in values} | {"attitude_time_offset": EFFECTS["attitude_time_offset"]}
     hypothesis = no_effect().with_effects([effects[name] for name in values], 1, values)
-    fit = Mock(spec=Fit, hypothesis=hypothesis, values=values, effects=hypothesis.effects, seen=[None])
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=values, effects=hypothesis.effects, n_recordings=1)
     fitter = Mock(spec=Fitter, problem=Mock(spec=Problem, recordings=[Mock(seconds=0.0)]))
     found = [
         (each.values["water_lock"][0], each.values["time_offset_jump"][0], {*each.values} & {*CLOCKS})
@@ -491,7 +491,7 @@ def test_of_two_leaps_back_the_second_is_put_behind_the_first():
     since_first_stamp = {name: value - 0.5 * name.endswith("at_s") for name, value in injection(leap).values.items()}
     values = {"dvl_time_offset": ({"seconds": 0.5},), "time_offset_jump": (since_first_stamp,)}
     hypothesis = no_effect().with_effects([EFFECTS[name] for name in names], 1, values)
-    fit = Mock(spec=Fit, hypothesis=hypothesis, values=values, seen=[None])
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=values, n_recordings=1)
     shown = [time_by_stamps(Fitter(problem), fit, name) for name in ("at_s", "again_at_s")]
     for (_, low, high), at in zip(shown, (101.3, 251.3), strict=True):
         assert low < at - 0.5 < high and high - low < 1.2
@@ -1200,5 +1200,5 @@ def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped():
 )
 def test_what_makes_a_reference_late_is_tried_as_a_lag_and_as_a_delay(late, starts):
     values = {name: ({EFFECTS[name].parameters[0].name: seconds},) for name, seconds in late.items()}
-    found = lags_and_delays(Mock(spec=Fit, values=values, seen=[None]), EFFECTS)
+    found = lags_and_delays(Mock(spec=Fit, values=values, n_recordings=1), EFFECTS)
     assert [(name, *per[0].values()) for one in found for name, per in one.items()] == starts
