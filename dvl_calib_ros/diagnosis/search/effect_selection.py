@@ -36,11 +36,7 @@ from ..noise.noise_level import estimate_noise
 from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ARM, ArmAmbiguity, guessed_arm
-from .backward_elimination import (
-    eliminate,
-    repeated_effects,
-    without_chance,
-)
+from .backward_elimination import eliminate, without_chance
 from .candidates import intermittent_effects, proposed, variants_about
 from .clock_jumps import hypotheses_with_jumps, with_jumps_in_gaps
 from .identifiability import Selected, identify_effects
@@ -139,7 +135,6 @@ def select(
         candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
         fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in hypotheses_with_jumps(fitter, fit, effects, every)]
-        fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
         for hypothesis in intermittent_effects(fitter, fit, effects):
             as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)

@@ -33,9 +33,6 @@ from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.noise.whitened_least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.search import candidates, observable_parameters
 from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, arm_change, lags_and_delays, with_changes
-from dvl_calib_ros.diagnosis.search.backward_elimination import (
-    repeated_effects,
-)
 from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks, intermittent_effects
 from dvl_calib_ros.diagnosis.search.clock_jumps import (
     DELAYS,
@@ -408,17 +405,6 @@ def test_how_a_run_begins_or_ends_is_no_leap():
     assert _delays(squares) == Delays((-0.5, 1.0), (20,))
 
 
-def test_a_second_leap_that_is_not_there_is_taken_back():
-    fitter, fit, _ = fitted(
-        scenario(effects=["time_offset_jump:seconds=0.8,at_s=100"], gnss_std=0.02),
-        {"time_offset_jump": {"seconds": 0.8, "at_s": 100.0, "again_seconds": 0.02, "again_at_s": 200.0}},
-    )
-    once = {name: effect.once for name, effect in EFFECTS.items()}
-    (alone,) = repeated_effects(fitter, [fit], EFFECTS, once)
-    assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
-    assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
-
-
 def test_a_leap_ahead_leaves_a_gap_in_the_stamps_and_none_in_time():
     """Samples after a leap of 1.84 s were taken for as much as 0.9 s late, for the 1.7 s until they had caught up."""
     time = np.arange(0.0, 40.0, 0.1)
@@ -523,19 +509,6 @@ def test_what_is_not_known_of_the_time_of_a_leap_is_in_the_intervals_of_all_size
     moved = fitter.fit(_with_time(fit, leap, "at_s", 0, 170.0), fit.noise, 3).hypothesis.vector()[6:]
     added = fitter.moved_by_time(fit, leap, "at_s", 0, (170.0, 200.0))[6:, 6:]
     assert np.diag(added) == pytest.approx(((moved - fit.hypothesis.vector()[6:]) / 1.96) ** 2 / 2.0)
-
-
-def test_two_recordings_are_not_asked_for_a_second_leap_at_one_time_of_both():
-    """Three runs of a boat had leaps of 0.1 to 1.7 s at 48 s and at 521 s, each."""
-    text = "time_offset_jump:seconds=0.8,at_s=100,again_seconds=-1.4,again_at_s=200"
-    both = [recording_of(simulate(scenario(effects=[text], seed=seed)), name=str(seed)) for seed in (1, 2)]
-    problem = make_problem(both, np.eye(3), np.zeros(3), [Offsets()] * 2)
-    once = {name: effect.once for name, effect in EFFECTS.items()}
-    leap = once["time_offset_jump"]
-    start = no_effect().with_effects([leap], 2, {leap.name: ({"seconds": 0.8, "at_s": 100.0},) * 2})
-    fitter = Fitter(problem)
-    fit = fitter.fit(start, white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval))
-    assert repeated_effects(fitter, [fit], EFFECTS, once) == []
 
 
 def test_a_lever_arm_and_a_delay_a_hundred_times_the_noise_are_exact():
