@@ -15,7 +15,6 @@ from ..fit.gauss_newton import Fit, Fitter
 from ..fit.selection_criteria import SlowNoiseOfFit, blocks_of
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
-from ..model.settings import SETTINGS
 from ..noise.noise_level import stretches_of
 from ..search.effect_selection import EffectSelection
 from ..search.unexplained import Unexplained
@@ -268,27 +267,20 @@ def noise_floor(selection: EffectSelection, unexplained: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
     It is the squared residual, so that noise common to the errors before and after cancels in the gap. The energy of an
-    unknown cause, and of slow noise beyond its fitted level, is subtracted; that absorbed by parameters is added.
+    unknown cause is subtracted; that absorbed by parameters is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     residual, measured = problem.errors(fit.seen), np.array(problem.measured)
-    slow = SlowNoiseOfFit.of_fit(problem, fit)
-    noise, slow_residual, explained = slow.noise, slow.left, np.zeros(len(slow.left))
-    if unexplained.found:
-        *_, noise, without = slow.with_nuisance(problem, slow.noise, unexplained.clearest)
-        explained, slow_residual = (slow_residual**2 - without**2).sum(axis=1), without
-    expected = noise.energy
-    beyond_expected = (slow_residual**2).sum(axis=1) - expected
     floor, of_sample = residual**2, problem.recording_of[problem.bin_of]
-    for recording in range(len(problem.recordings)):
-        of_bin, at = problem.recording_of == recording, of_sample == recording
-        error = noise.energy_error / np.sqrt(of_bin.mean())
-        excess = float(beyond_expected[of_bin].mean())
-        systematic = max(0.0, float(explained[of_bin].mean()))
-        if excess > SETTINGS.noise_tolerance * error * float(expected[of_bin].mean()):
-            systematic += excess
-        energy = float(floor[at].sum(axis=1).mean())
-        floor[at] *= max(0.0, energy - systematic) / max(energy, 1e-300)
+    if unexplained.found:
+        slow = SlowNoiseOfFit.of_fit(problem, fit)
+        without = slow.with_nuisance(problem, slow.noise, unexplained.clearest).left
+        explained = (slow.left**2 - without**2).sum(axis=1)
+        for recording in range(len(problem.recordings)):
+            at = of_sample == recording
+            systematic = max(0.0, float(explained[problem.recording_of == recording].mean()))
+            energy = float(floor[at].sum(axis=1).mean())
+            floor[at] *= max(0.0, energy - systematic) / max(energy, 1e-300)
     floor[:, measured] += _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
     return floor
 

@@ -57,8 +57,7 @@ def prior_std(hypothesis: Hypothesis) -> Array:
 class Fit:
     """Fitted hypothesis. residual: (M, A) m/s, winsorised. system: of the last step. own_noise: whitened residual from
     simulated noise of the velocities. deviance: whitened squares and prior, minus the squares of own_noise: a delay
-    changes the interpolation phase and a low-pass smooths noise, neither of which is evidence. of_tails: additional
-    squares of own_noise if its tails are heavier than simulated."""
+    changes the interpolation phase and a low-pass smooths noise, neither of which is evidence."""
 
     problem: Problem
     hypothesis: Hypothesis
@@ -67,7 +66,6 @@ class Fit:
     system: WhitenedLeastSquares
     deviance: float
     own_noise: Array
-    of_tails: float = 0.0
     # results of tests of this fit, by name, each computed once
     kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -90,11 +88,10 @@ class Fit:
         """Return the lower bound of the deviance gain over another fit.
 
         The deviances of two fits whose simulated whitened noise differs by d differ by σ = 2 |d| under the null
-        hypothesis. Heavy tails of that noise reduce the gain further.
+        hypothesis.
         """
         other = self.own_noise - reduced.own_noise
-        bound = reduced.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
-        return bound - max(reduced.of_tails - self.of_tails, 0.0)
+        return reduced.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -247,9 +244,7 @@ class Fitter:
             hypothesis, residual, misfit = last, last_residual, last_misfit
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
-        of_each = own_noise.reshape(len(self.problem.perturbed), -1)
-        of_tails = float((np.array(self.problem.noise_excess) - 1.0) @ (of_each**2).sum(axis=1))
-        return Fit(self.problem, hypothesis, residual, noise, system, deviance, own_noise, of_tails)
+        return Fit(self.problem, hypothesis, residual, noise, system, deviance, own_noise)
 
     def _without_own_noise(self, at: _Linearisation, hypothesis: Hypothesis, noise: Noise) -> WhitenedLeastSquares:
         """Subtract from a linearisation's system the contribution of the velocities' own noise, which is simulated.
@@ -302,13 +297,6 @@ class Fitter:
             self._fits[key] = self.fit(nearest, noise, evaluated=evaluated)
             self.problem.fitted[model] = [self._fits[key].hypothesis]
         return self._fits[key]
-
-    def one_step(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
-        """Return the misfit after one linear step, and the step's end; start: a hypothesis with the same evaluation."""
-        columns = self.columns(start, fit.seen)
-        system = self._system(fit.noise, columns, fit.residual, start)
-        step = system.solution()
-        return system.misfit(step), start.moved(step)
 
     def refined(self, fit: Fit, steps: Sequence[float]) -> Fit:
         """Refine the times at which a fit's effects begin and end, beyond the grid."""

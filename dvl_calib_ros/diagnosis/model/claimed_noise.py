@@ -21,8 +21,6 @@ from .settings import SETTINGS
 MAX_EXPONENT = 2.0
 # Least standard deviation of the logarithm of reported values that is informative
 MIN_LOG_STD = 0.05
-# Bound of the log noise level about its mean
-MAX_LOG_LEVEL = 4.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ def relative_std(log_claims: Array, values: Array, names: Sequence[str], stretch
         found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
         if found.is_significant.all():
             logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, MAX_EXPONENT)
-            return np.asarray(np.exp(np.clip(logarithm, -MAX_LOG_LEVEL, MAX_LOG_LEVEL)))
+            return np.asarray(np.exp(logarithm))
         kept.pop(int(np.argmin(found.exponents / found.stds)))
     return np.ones(values.shape)
 

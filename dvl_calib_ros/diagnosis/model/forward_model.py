@@ -205,12 +205,6 @@ class Problem:
         )
         return replace(self, recordings=tuple(recordings))
 
-    @cached_property
-    def noise_excess(self) -> tuple[float, ...]:
-        """Return the variance ratio of actual to simulated noise for each of `perturbed`, at least 1."""
-        dvl = max(one.dvl.noise_excess for one in self.recordings)
-        return (dvl, max(one.reference.noise_excess for one in self.recordings))[: len(self.perturbed)]
-
     # ------------------------------------------------------------------ the model
 
     def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:

@@ -25,11 +25,10 @@ class DiagnosisSettings:
 
     outlying: robust standard deviations of an outlier. conclusive: deviance that leaves no doubt between two fits.
 
-    Judging: block, folds: of hold-out. noise_tolerance: standard errors by which the noise of all frequencies may
-    exceed the high ones. instead_of: deviance up to which an unknown cause may replace effects; a larger unknown cause
-    would be significant without a test, and interpolation leaves more than noise of it. prior_angle, prior_scale:
-    standard deviation of misalignment and scale. They hold insignificant parameters (roll, scale of sway), which would
-    absorb a lever arm.
+    Judging: block, folds: of hold-out. instead_of: deviance up to which an unknown cause may replace effects; a larger
+    unknown cause would be significant without a test, and interpolation leaves more than noise of it. prior_angle,
+    prior_scale: standard deviation of misalignment and scale. They hold insignificant parameters (roll, scale of
+    sway), which would absorb a lever arm.
     """
 
     max_stream_rate: float = 10.0
@@ -48,7 +47,6 @@ class DiagnosisSettings:
     robust_level: float = 0.0005
     block: float = 20.0
     folds: int = 5
-    noise_tolerance: float = 3.0
     outlying: float = 6.0
     conclusive: float = 40.0
     instead_of: float = 1500.0

@@ -28,9 +28,6 @@ NOISE_POWER_RATIO, MOTION_POWER_RATIO = 1.4, 2.5
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Longest interval, s, of a stream that resolves turns and waves: only its noise is removed; samples per smoothing cubic
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
-# Relative excess of tails that is significant (3 σ): the median of
-# neighbours' differences has a relative σ of 1.6 / √n
-HEAVY_TAIL_Z = 3.0 * 1.6
 # Largest product of the intervals to both neighbours, in usual intervals; at the middle of two samples it is 0.25
 MAX_NEIGHBOUR_PRODUCT = 0.4
 
@@ -129,22 +126,6 @@ class Curve:
         if len(self.time) < 10:
             return np.zeros(self.values.shape[1])
         return robust_std(np.diff(self.values, 4, axis=0) / self.relative_noise[2:-2]) / np.sqrt(70.0)
-
-    @cached_property
-    def noise_excess(self) -> float:
-        """Return the significant variance ratio of noise without outliers to a usual sample's noise.
-
-        1 for normal noise, more for Student's t of few degrees of freedom; 1 for a slow stream, whose turns look alike.
-        """
-        if self.interval > FAST_ENOUGH_S or len(self.time) < MIN_SPECTRUM:
-            return 1.0
-        deviation = np.diff(self.values, 4, axis=0) / self.relative_noise[2:-2]
-        std = robust_std(deviation)
-        deviation, std = deviation[:, std > 0.0], std[std > 0.0]
-        if not len(std):
-            return 1.0
-        clipped = np.sqrt(np.mean((np.clip(deviation / std, -SETTINGS.outlying, SETTINGS.outlying)) ** 2))
-        return float(np.maximum(clipped / (1.0 + HEAVY_TAIL_Z / np.sqrt(deviation.size)), 1.0) ** 2)
 
     @cached_property
     def relative_noise(self) -> Array:

@@ -15,8 +15,6 @@ from .recorded_streams import RecordedStreams
 from .settings import SETTINGS
 from .stream_curve import FAST_ENOUGH_S
 
-# Longer silences (s) are pauses: they do not widen the bins
-PAUSE_S = 60.0
 # Interval, s, of the motion that a filter follows if the grid is slower than `FAST_ENOUGH_S`: from slopes at 1 Hz, a
 # wave of 5 s is a quarter too small
 MOTION_INTERVAL_S = 0.1
@@ -98,8 +96,7 @@ def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     by_dvl = float(np.linalg.norm(recording.dvl.roughness)) > float(np.linalg.norm(recording.reference.roughness))
     base, clock = (recording.dvl, ActsOn.DVL_CLOCK) if by_dvl else (recording.reference, ActsOn.REFERENCE_CLOCK)
     base_delay_s = offsets.dvl if by_dvl else offsets.reference
-    steps = np.diff(base.time)
-    seconds = max(base.time[-1] - base.time[0] - steps[steps > PAUSE_S].sum(), base.interval)
+    seconds = len(base.time) * base.interval  # a pause does not widen the bins
     width = max(settings.bins_per_interval * base.interval, settings.shortest_bin, seconds / settings.max_bins)
     per_bin = max(2, round(width / base.interval))
     streams = (recording.dvl, offsets.dvl), (recording.reference, offsets.reference)

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...effects.base import Effect
 from ..fit.gauss_newton import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
-from ..fit.selection_criteria import penalty, step_of_times, windows
+from ..fit.selection_criteria import penalty, windows
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
 from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
-from .clock_jumps import LEAP
 
 # Variants to combine; proposals fitted per round
 SHORTLIST, N_PROPOSALS = 12, 7
@@ -76,7 +75,7 @@ def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hy
     own = tuple(range(len(fit.effects)))
     return [
         *(combined(fitter, fit, table, chosen) for chosen in (to_fit if own in to_fit else [*to_fit, own])),
-        *by_other_clocks(fitter, fit, effects),
+        *by_other_clocks(fit, effects),
         *_with_lag_or_delay(fit, effects),
     ]
 
@@ -122,7 +121,7 @@ def _combinations(
         scored += [
             (table.misfit((*chosen, index)) + sum(cost[i] for i in (*chosen, index)), (*chosen, index))
             for index in usable
-            if table.variants[index].effect.name not in names and len(chosen) < SETTINGS.max_effects
+            if table.variants[index].effect.name not in names
         ]
     scored.sort()
     scored = [each for each in scored if _has_no_redundant_clock(table, each[1])]
@@ -263,22 +262,16 @@ def _has_no_redundant_clock(table: LinearisedModel, chosen: Sequence[int]) -> bo
     return ATTITUDE_CLOCK not in names or len(names & set(CLOCKS)) == 1
 
 
-def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """Return hypotheses with a fit's clock offsets assigned to other clocks; large offsets exceed the linear range.
-
-    A clock jump at the beginning is a constant DVL delay.
-    """
+def by_other_clocks(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """Return hypotheses with a fit's clock offsets assigned to other clocks; large offsets exceed the linear range."""
     n, values = fit.n_recordings, fit.values
-    clocks = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
-    if not set(clocks) & set(values):
+    if not set(CLOCKS) & set(values):
         return []
     dvl, reference, attitude = (
         np.array([each["seconds"] for each in values[name]]) if name in values else np.zeros(n) for name in CLOCKS
     )
     dvl, reference = dvl - attitude, reference - attitude
-    if LEAP in clocks:
-        dvl = dvl + [each["seconds"] for each in values[LEAP]]
-    kept = [effect for effect in fit.effects if effect.name not in clocks]
+    kept = [effect for effect in fit.effects if effect.name not in CLOCKS]
     alternatives = [
         {ATTITUDE_CLOCK: -0.5 * (dvl + reference)}, {DVL_CLOCK: dvl - reference}, {REFERENCE_CLOCK: reference - dvl},
         {DVL_CLOCK: dvl, REFERENCE_CLOCK: reference},
@@ -313,11 +306,3 @@ def _with_lag_or_delay(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothes
         fit.hypothesis.with_effects([*others, *(effects[name] for name in start)], fit.n_recordings, start)
         for start in lags_and_delays(fit, effects)
     ]
-
-
-def jumps_at_start(fitter: Fitter, fit: Fit) -> bool:
-    """Return whether the fit has one clock jump only, before the first time that is tried."""
-    jumps = fit.values.get(LEAP, ())
-    first = step_of_times(fitter.problem)
-    twice = any(np.isfinite(jump.get("again_at_s", np.inf)) for jump in jumps)
-    return bool(jumps) and not twice and all(jump["at_s"] < first for jump in jumps)

@@ -63,7 +63,7 @@ def hypotheses_with_jumps(
     steps = np.diff(delays.seconds).tolist()
     values = {"seconds": steps[0], "at_s": times[0]}
     if len(steps) > 1:
-        values |= {"again_seconds": steps[1], "again_at_s": max(times[1], times[0])}
+        values |= {"again_seconds": steps[1], "again_at_s": times[1]}
     jump = every[LEAP] if len(steps) > 1 else single[LEAP]
     return _hypotheses(fit, kept, single, jump, values, delays.seconds[0])
 

@@ -132,7 +132,7 @@ def select(
     best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):
-        candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
+        candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fit, heading)]
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
         fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in hypotheses_with_jumps(fitter, fit, effects, every)]
         finer = finer_steps(problem)
@@ -257,19 +257,15 @@ BY_YAW = frozenset({HEADING, MOVED, DRIFT, "water_lock"})
 OF_DRIFT = "rad_per_hour"
 
 
-def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hypothesis]:
+def with_two_cycles(fit: Fit, heading: Effect | None) -> list[Hypothesis]:
     """Propose a heading error of two cycles in place of effects that rotate DVL against reference.
 
-    Its parameters are shared or per recording. A fit without such effects gets only promising proposals, a single
-    recording none. heading: with all its parameters; None if untestable.
+    Its parameters are shared or per recording. A single recording gets none. heading: with all its parameters; None if
+    untestable.
     """
     if heading is None or fit.n_recordings < 2:
         return []
-    found = [_with_heading_instead(fit, BY_YAW, each) for each in _two_cycles(heading)]
-    if BY_YAW & fit.values.keys():
-        return found
-    straight = [fitter.one_step(fit, each) for each in (fit.hypothesis, *found)]
-    return [each for misfit, each in straight[1:] if misfit < straight[0][0] - SETTINGS.conclusive]
+    return [_with_heading_instead(fit, BY_YAW, each) for each in _two_cycles(heading)]
 
 
 def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit, dict[str, str]]:
@@ -322,8 +318,6 @@ def _with_heading_instead(fit: Fit, names: Collection[str], heading: Effect) -> 
 OTHER_STREAM_Z = 4.0
 # Bounds of the ratio of both deviations, projected: around a turn between samples they differ more
 DEVIATION_RATIO = (0.6, 1.7)
-# Fewest samples for a scatter
-MIN_SCATTER_SAMPLES = 30
 
 
 def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
@@ -360,7 +354,7 @@ def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn
     of_dvl = clock is ActsOn.DVL_CLOCK
     curve, other = (recording.dvl, recording.reference) if of_dvl else (recording.reference, recording.dvl)
     kept = np.ones(len(curve.time), dtype=bool)
-    if curve.interval <= FAST_ENOUGH_S or len(curve.time) < MIN_SCATTER_SAMPLES:
+    if curve.interval <= FAST_ENOUGH_S:
         return kept
     injections = hypothesis.injections(index)
     true = true_times(injections, clock, curve.time)
@@ -370,7 +364,7 @@ def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn
     suspicious = other.covers(seen.reference_stamps if of_dvl else seen.dvl_stamps)
     suspicious &= np.abs(error / _scatter(error)).max(axis=1) > OTHER_STREAM_Z
     others = curve.part(~suspicious)  # adjacent outliers would confirm each other
-    if not suspicious.any() or len(others.time) < MIN_SCATTER_SAMPLES:
+    if not suspicious.any():
         return kept
 
     def in_body(values: Array) -> Array:

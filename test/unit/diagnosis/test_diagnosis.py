@@ -143,10 +143,9 @@ def test_what_comes_and_goes_does_so_at_another_time_by_another_clock():
     effects = {name: EFFECTS[name].once for name in values} | {"attitude_time_offset": EFFECTS["attitude_time_offset"]}
     hypothesis = no_effect().with_effects([effects[name] for name in values], 1, values)
     fit = Mock(spec=Fit, hypothesis=hypothesis, values=values, effects=hypothesis.effects, n_recordings=1)
-    fitter = Mock(spec=Fitter, problem=Mock(spec=Problem, recordings=[Mock(seconds=0.0)]))
     found = [
         (each.values["water_lock"][0], each.values["time_offset_jump"][0], {*each.values} & {*CLOCKS})
-        for each in by_other_clocks(fitter, fit, effects)
+        for each in by_other_clocks(fit, effects)
     ]
     assert [its for *_, its in found[:2]] == [{"attitude_time_offset"}, {"dvl_time_offset"}]
     assert [its["from_s"] for its, *_ in found] == pytest.approx([110.9, 110.8, 110.9, 110.0])

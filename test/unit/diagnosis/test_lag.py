@@ -9,14 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.diagnosis.answer.gap_closure import high_frequency_variance, noise_floor
-from dvl_calib_ros.diagnosis.fit.gauss_newton import Fit, Fitter
+from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
 from dvl_calib_ros.diagnosis.fit.parametric_bootstrap import _reference
 from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import white_noise
-from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import lag_change, with_changes
 from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -111,22 +110,6 @@ def test_over_a_gap_nothing_is_told_of_what_was_between():
     gap = int(np.argmax(np.diff(time)))
     assert own[gap + 1] == own[gap] + 1
     assert np.sort(np.diff(between))[-2] == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(("worse", "std"), [(5.0, 0.31), (7.0, 0.1)])
-def test_a_lag_beside_free_clocks_may_be_what_it_is_without_them(worse, std):
-    """With DVL and reference early by 0.3 s it was 0.52 s, to 0.1 of them; without, which fits as well, 0.81."""
-    clock = EFFECTS["dvl_time_offset"]
-    lags = [({"time_constant_s": seconds},) for seconds in (0.81, 0.52)]
-    alone = no_effect().with_effects([LAG], 1, {LAG.name: lags[0]})
-    both = no_effect().with_effects([clock, LAG], 1, {clock.name: ({"seconds": -0.3},), LAG.name: lags[1]})
-    fit, joint = (
-        Mock(spec=Fit, hypothesis=each, values=each.values, deviance=deviance)
-        for each, deviance in ((alone, 100.0 + worse), (both, 100.0))
-    )
-    found = with_changes(joint, 0.1**2 * np.eye(8), lag_change(fit, joint))
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), [*[0.1] * 7, std], atol=0.005)
-    assert not lag_change(Mock(spec=Fit, values={}), joint)
 
 
 def test_made_up_recordings_lag_as_the_fit_does():

@@ -13,10 +13,9 @@ from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.registration.unregistrable_clocks import lag
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import blocks_of
 from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, relative_std
-from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
+from dvl_calib_ros.diagnosis.model.forward_model import make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, make_recording
 from dvl_calib_ros.diagnosis.model.settings import SETTINGS
@@ -26,7 +25,6 @@ from dvl_calib_ros.diagnosis.noise import noise_level
 from dvl_calib_ros.diagnosis.noise.noise_level import log_reported
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.search.effect_selection import without_slow_outliers
-from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -367,34 +365,6 @@ def test_of_a_fit_that_is_far_off_nothing_is_taken_for_an_outlier(rng):
     robust = white_noise(residual, (slice(0, 200),), None).robust(residual)
     np.testing.assert_allclose(robust[:, 1], residual[:, 1])
     assert np.abs(robust[:, 0]).max() < 0.04
-
-
-@pytest.mark.parametrize(("degrees", "low", "high"), [(0, 1.0, 1.0), (3, 1.15, 1.6)])
-def test_tails_of_noise_are_known_from_samples_that_are_close(rng, degrees, low, high):
-    """A lag beside a clock that undoes it takes noise off: twice as much of Student's as of what was made up, and a
-    null with heavy tails had both."""
-    time = np.arange(1850) / 5.0
-    white = rng.standard_t(degrees, (1850, 3)) / np.sqrt(3.0) if degrees else rng.standard_normal((1850, 3))
-    curve = Curve(time, np.sin(time[:, None] / [3.0, 5.0, 7.0]) + 0.01 * white)
-    assert low <= curve.noise_excess <= high
-    assert curve.part(np.arange(1850) % 5 == 0).noise_excess == 1.0
-
-
-def test_what_heavy_tails_add_to_the_noise_that_a_lag_takes_off_is_not_explained(monkeypatch):
-    given = streams(seconds=200.0, gnss_std=0.03)
-    problem = make_problem([recorded(given)], np.eye(3), np.zeros(3), [Offsets()])
-    fitter = Fitter(problem)
-    noise = white_noise(fitter.evaluated(no_effect())[1], problem.segments, None, problem.interval)
-    lag = EFFECTS["reference_lag"]
-    start = no_effect().with_effects([lag], 1, {lag.name: ({"time_constant_s": 0.4},)})
-    gains = []
-    for noise_excess in ((1.0, 1.0), (1.5, 1.5)):
-        monkeypatch.setattr(Problem, "noise_excess", noise_excess[: len(problem.perturbed)])
-        rest, fit = fitter.fit(no_effect(), noise), fitter.fit(start, noise, fixed=frozenset([lag.name]))
-        gains.append(fit.gain_over(rest))
-    taken_off = float(rest.own_noise @ rest.own_noise - fit.own_noise @ fit.own_noise)
-    assert gains[1] - gains[0] == pytest.approx(-0.5 * max(taken_off, 0.0))
-    assert taken_off > 1.0
 
 
 def test_an_outlier_does_not_shift_the_level_of_slow_noise():
