@@ -53,9 +53,7 @@ VISIBLE_TIMES_TYPICAL = 3.0
 # Least share of observable effects for the verdict NO_GAP
 MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
-# Least share of the gap's energy, on held-out data, that effects must close to explain it
-MIN_CLOSURE = 0.2
-# Least closure of an explanation; less is a part of one (issue 46)
+# Least closure of an explanation; below its complement nothing is explained, between them a part (issue 46)
 FULL_CLOSURE = 0.8
 
 
@@ -118,7 +116,8 @@ def diagnose_recordings(
     covariance, times = covariance_of(selection)
     gap = with_closure(gap, selection, covariance, residuals)
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
-    visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
+    times_typical = {name: _times_typical(testable[name], sizes) for name, sizes in detectable.items()}
+    visible = [name for name, times in times_typical.items() if times <= VISIBLE_TIMES_TYPICAL]
     verdict = _verdict(selection, unexplained, gap, len(visible) / len(testable))
     if unexplained.found:  # the unknown cause may contribute
         shift = nuisance_shift(selection.fitter.problem, selection.fit, unexplained)
@@ -144,7 +143,7 @@ def diagnose_recordings(
         where=tuple(places(selection.fitter, selection.base, selection.fit, columns)) if is_gap else (),
         untestable=untestable,
         minimum_detectable=detectable,
-        next_steps=_next_steps(verdict, selection.selected, testable, untestable, detectable),
+        next_steps=_next_steps(verdict, selection.selected, testable, untestable, times_typical),
         notes=tuple(notes),
         series=collect_series(selection, residuals, unexplained, covariance) if with_series else None,
         calibration=tuple(around(float(value), std) for value, std in calibration),
@@ -236,7 +235,7 @@ def _verdict(selection: EffectSelection, unexplained: Unexplained, gap: Gap, vis
     """Return the verdict; a systematic residual or a failure on held-out data makes it unknown."""
     if unexplained.found or gap.fails_held_out:
         return DiagnosisVerdict.UNKNOWN
-    if selection.selected and gap.closure < MIN_CLOSURE:
+    if selection.selected and gap.closure < 1.0 - FULL_CLOSURE:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
@@ -264,9 +263,9 @@ def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: in
     return {spec.name: factor * float(each) for spec, each in zip(amplitudes(effect), own, strict=False)}
 
 
-def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:
-    typical = {spec.name: spec.typical for spec in effect.parameters}
-    return any(size <= VISIBLE_TIMES_TYPICAL * typical[name] for name, size in sizes.items())
+def _times_typical(effect: Effect, sizes: Mapping[str, float]) -> float:
+    """Return the least ratio of detectable sizes to the parameters' typical sizes."""
+    return min(sizes[spec.name] / spec.typical for spec in effect.parameters if spec.name in sizes)
 
 
 def _found_effect(
@@ -333,7 +332,7 @@ def _next_steps(
     selected: Sequence[Selected],
     testable: Mapping[str, Effect],
     untestable: Mapping[str, str],
-    detectable: Mapping[str, Mapping[str, float]],
+    times_typical: Mapping[str, float],
 ) -> tuple[Reason, ...]:
     """Return manoeuvres that separate equivalent effects, or that make the least observable effects observable."""
     confounded = [(each.effect, [testable[name] for name in each.equivalent]) for each in selected if each.equivalent]
@@ -349,13 +348,8 @@ def _next_steps(
         )
     if verdict is DiagnosisVerdict.UNKNOWN:
         return (finding("NEXT_SAME_ROUTE"),)
-
-    def times_typical(name: str) -> float:
-        typical = {spec.name: spec.typical for spec in testable[name].parameters}
-        return min(size / typical[key] for key, size in detectable[name].items())
-
-    worst = sorted(detectable, key=times_typical, reverse=True)[:2]
-    if all(times_typical(name) <= 1.0 for name in worst):
+    worst = sorted(times_typical, key=lambda name: times_typical[name], reverse=True)[:2]
+    if all(times_typical[name] <= 1.0 for name in worst):
         needs = ", ".join(sorted(set(untestable.values())))
         return (finding("NEXT_RECORD", needs=needs, names=", ".join(untestable)) if needs else finding("NEXT_NOTHING"),)
     return tuple(finding("NEXT_SHOW", name=name, manoeuvre=testable[name].manoeuvre) for name in worst)

@@ -16,15 +16,12 @@ from ...effects.registry import EFFECTS
 from ...errors import InputError
 from ..fit.cross_validation import fitted_without, folds_of
 from ..model.hypothesis import Hypothesis, is_time_of_run
-from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, CLOCKS, TWO_CLOCKS
+from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, ATTITUDE_CLOCK, CLOCKS, TWO_CLOCKS
 from ..search.event_scan import TIME_TOLERANCE_S
 from .results import Diagnosis, FoundEffect, certain_sizes
 
-OFFSETS = {
-    "dvl_time_offset": "dvl_time_offset",
-    "reference_time_offset": "reference_time_offset",
-    "attitude_time_offset": "imu_time_offset",
-}
+# Parameter that corrects each clock
+OFFSETS = {name: name for name in TWO_CLOCKS} | {ATTITUDE_CLOCK: "imu_time_offset"}
 # Effects that a parameter can correct
 CORRECTED = (ARM, *OFFSETS, "water_lock", "clock_drift", "time_offset_jump")
 

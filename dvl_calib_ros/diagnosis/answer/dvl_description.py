@@ -66,13 +66,12 @@ def dvl_seen(selection: EffectSelection, parameters: Parameters) -> DvlSeen:
     repeats, received = (sum(getattr(each, name) for each in problem.recordings) for name in ("repeats", "received"))
     if repeats:
         sizes[STALE] = float(np.sqrt(repeats / received)) * _rms(np.diff(measured, axis=0))
-    streams = [recording.dvl for recording in problem.recordings]
     return DvlSeen(
         mounting_rpy=_triple(parameters.mounting_rpy),
         lever_arm=_triple(parameters.lever_arm),
         time_offset=parameters.dvl_time_offset,
         clock_drift=parameters.dvl_clock_drift,
-        rate_hz=1.0 / float(np.median([stream.interval for stream in streams])),
+        rate_hz=1.0 / float(np.median([each.dvl.interval for each in problem.recordings])),
         noise_std=_triple(_noise(problem.recordings, selection)),
         speed=_triple(np.sqrt((measured**2).mean(axis=0))),
         sizes=sizes,

@@ -145,8 +145,8 @@ def _fit_own_parameters(selection: EffectSelection, hypothesis: Hypothesis, reco
 
 def only(problem: Problem, recording: int) -> Problem:
     """Return the problem of one recording."""
-    problem_of_one = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
-    return replace(problem_of_one, grids=(problem.grids[recording],), of_axes=problem.measured)
+    streams, grid = problem.recordings[recording], problem.grids[recording]
+    return Problem((streams,), problem.rotation_dvl_from_body, problem.lever_arm, (grid,), problem.measured)
 
 
 def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:

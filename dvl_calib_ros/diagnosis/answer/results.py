@@ -124,11 +124,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
             "closure_ci95": list(gap.interval),
             "held_out": True,
             "drift_m_per_km": dict(zip(("before", "after"), (each.per_km for each in gap.drift or ()), strict=False)),
-            **(
-                {"by_recording": {n: {"before_mps": b, "after_mps": a} for n, (b, a) in gap.by_recording.items()}}
-                if gap.by_recording
-                else {}
-            ),
+            **_given(by_recording={n: {"before_mps": b, "after_mps": a} for n, (b, a) in gap.by_recording.items()}),
         },
         "effects": [
             {
@@ -137,8 +133,8 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
                 "parameters": _parameters(effect.parameters),
                 "closure": effect.closure,
                 "p_adjusted": effect.p,
-                **_by_recording(effect),
-                **_combination_document(effect),
+                **_given(by_recording={name: _parameters(each) for name, each in effect.by_recording.items()}),
+                **_given(combination=_combination_document(effect.combination)),
             }
             for effect in diagnosis.effects
         ],
@@ -171,24 +167,21 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _by_recording(effect: FoundEffect) -> dict[str, Any]:
-    if not effect.by_recording:
-        return {}
-    return {"by_recording": {name: _parameters(values) for name, values in effect.by_recording.items()}}
+def _given(**values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that are not empty, by name."""
+    return {name: value for name, value in values.items() if value}
 
 
-def _combination_document(effect: FoundEffect) -> dict[str, Any]:
+def _combination_document(found: Combination | None) -> dict[str, Any]:
     """Return plain data of the observable combination of lever arm and clock, empty without one."""
-    found = effect.combination
     if found is None:
         return {}
-    known = {
+    return {
         "parameter": found.parameter,
         "clock": found.clock,
         "speed_mps": found.speed,
         "arm_less_speed_times_delay_m": _value(found.value),
     }
-    return {"combination": known}
 
 
 def _dvl_document(dvl: DvlSeen) -> dict[str, Any]:

@@ -29,8 +29,10 @@ MAX_MISFIT_INCREASE = 30.0
 CHANCE_GAIN_Z = 1.5
 # Prior σ of an effect's parameters, in typical sizes: wide, to act only on unobservable parameters
 PRIOR_IN_TYPICAL = 50.0
-# Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
-SKIP_MARGIN, NONLINEAR_SHARE = 2.0, 0.2
+# Deviance within which two fits are equal
+EQUAL_DEVIANCE = 2.0
+# A fit is skipped as worse if its bound is worse by that, plus this share of its first step's gain for nonlinearity
+NONLINEAR_SHARE = 0.2
 # A burst: outliers with neighbours beyond half of that, of at most this share of the recording
 MAX_BURST_SHARE = 0.02
 # Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2)
@@ -342,10 +344,10 @@ class Fitter:
         minimum = linearised.system.misfit(linearised.system.solution())
         gain = self._misfit(noise, linearised.residual, hypothesis) - minimum
         minimum -= float(own_noise @ own_noise)
-        if minimum > deviance + SKIP_MARGIN + NONLINEAR_SHARE * gain:
+        if minimum > deviance + EQUAL_DEVIANCE + NONLINEAR_SHARE * gain:
             return True
         unattainable = min(promised, gain)
-        return minimum + unattainable > deviance + 2.0 * SKIP_MARGIN + NONLINEAR_SHARE * (gain - unattainable)
+        return minimum + unattainable > deviance + 2.0 * EQUAL_DEVIANCE + NONLINEAR_SHARE * (gain - unattainable)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """Return the time at which an effect begins or ends, with its 95 per cent interval."""

@@ -19,12 +19,10 @@ from ..model.seen import Seen
 from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
-from .gauss_newton import Fit, Fitter, n_amplitudes, prior_std
+from .gauss_newton import EQUAL_DEVIANCE, Fit, Fitter, n_amplitudes, prior_std
 
 # Parts of the run at whose ends intermittent effects may begin or end
 WINDOW_STEPS = 10
-# Deviance within which the more usual effects are preferred
-EQUAL_DEVIANCE = 2.0
 # Time constant, s, of the slowest noise as an alternative to an effect: GNSS multipath lasts minutes
 SLOWEST_S = 100.0
 # Simulated residuals of slow noise

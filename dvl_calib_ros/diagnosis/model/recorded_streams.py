@@ -90,8 +90,8 @@ SECOND_NS = 1_000_000_000
 SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3", ".bag")
 # m/s; while the reference is faster than this, a DVL velocity of zero is a dropout
 MOVING_MPS = 0.1
-# Lowest rate of averaged streams, however long a recording is
-SLOWEST_AVERAGE_HZ = 2.5
+# Lowest rate of averaged streams, however long a recording is: one sample per shortest bin
+SLOWEST_AVERAGE_HZ = 1.0 / SETTINGS.shortest_bin
 # Samples of the reference per DVL sample that suffice for the comparison
 PER_DVL_SAMPLE = 2.5
 

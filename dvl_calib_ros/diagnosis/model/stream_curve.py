@@ -20,8 +20,8 @@ from ...calibration.streams.outliers import deviation_from_neighbours, neighbour
 from .claimed_noise import relative_noise
 from .settings import SETTINGS
 
-# Fewest samples for a spectrum that separates motion from noise; number of bands whose power is averaged
-MIN_SPECTRUM, BANDS = 60, 40
+# Bands of a spectrum whose power is averaged
+BANDS = 40
 # Ratios of a band's power to noise up to which it is removed as noise, and from which it is kept
 NOISE_POWER_RATIO, MOTION_POWER_RATIO = 1.4, 2.5
 # Weights of fourth differences
@@ -87,7 +87,7 @@ class Curve:
         """
         values = self.values.copy()
         for part in self.stretches:
-            if part.stop - part.start < MIN_SPECTRUM or self.interval > FAST_ENOUGH_S:
+            if part.stop - part.start < SETTINGS.min_bins or self.interval > FAST_ENOUGH_S:
                 continue
             spectrum, _ = _sines((self.like or self).values[part])
             variance = self.noise**2 * (self.relative_noise[part] ** 2).mean(axis=0)

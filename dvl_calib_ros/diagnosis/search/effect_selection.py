@@ -63,7 +63,6 @@ class EffectSelection:
     base: Fit
     fit: Fit
     fitter: Fitter
-    guesses: tuple[FirstGuess, ...]
     testable: Mapping[str, Effect]
     trade_off: ArmAmbiguity | None = None
     changes: Mapping[str, float] = field(default_factory=dict)
@@ -155,7 +154,7 @@ def select(
     found = identify_effects(fitter, fit, guesses, effects, equivalent)
     base = fitter.fit_kept(found.fit.hypothesis.with_effects([], len(recordings), {}), found.fit.noise)
     return EffectSelection(
-        found.selected, base, found.fit, fitter, guesses, effects, found.trade_off, found.changes, wider.hypothesis
+        found.selected, base, found.fit, fitter, effects, found.trade_off, found.changes, wider.hypothesis
     )
 
 
@@ -246,9 +245,6 @@ def _with_observable_arm(
         hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
         fitter, fit = with_noise_reestimated(fitter, fitter.fit(hypothesis, fit.noise), every)
     return fitter, fit, effects
-
-
-__all__ = ["EffectSelection", "Selected", "select"]
 
 
 HEADING, MOVED, DRIFT = "heading_error", "mounting_moved", "misalignment_drift"

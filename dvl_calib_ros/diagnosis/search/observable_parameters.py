@@ -41,13 +41,13 @@ def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> 
     """Return an effect without parameters that have little influence on the residual."""
     specs = amplitudes(effect)
     columns = problem.columns(no_effect(), seen, effect, default_values(effect, problem))
-    squares = (columns**2).sum(axis=1).mean(axis=0)
-    of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of recordings the most informative
-    sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
+    squares = (columns**2).sum(axis=1).mean(axis=0).reshape(-1, len(specs))
+    by_unit = np.sqrt(squares.max(axis=0))  # of recordings the most informative
+    sizes = by_unit * [spec.typical for spec in specs]
     threshold = MIN_SHARE * min(float(sizes.max()), USUAL_BIAS_MPS)
     out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < threshold}
     if effect.name == ARM:
-        by_metre = zip(specs, np.sqrt(of_each).tolist(), strict=True)
+        by_metre = zip(specs, by_unit.tolist(), strict=True)
         out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < MIN_SHARE * USUAL_BIAS_MPS}
     return effect.without(out)
 

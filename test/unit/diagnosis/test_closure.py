@@ -66,7 +66,7 @@ def test_nine_of_ten_true_closures_are_inside_the_interval(memory_s, times):
             fitter, fitter.fit(start, white_noise(residual, problem.segments, None)), EFFECTS
         )
         base = fitter.fit(no_effect(), fit.noise)
-        selection = EffectSelection((Selected(effect, -50.0, ()),), base, fit, fitter, (), EFFECTS)
+        selection = EffectSelection((Selected(effect, -50.0, ()),), base, fit, fitter, EFFECTS)
         residuals = held_out(selection, nothing)
         gap = with_closure(measure_gap(selection, residuals), selection, fit.covariance(blocks_of(problem)), residuals)
         low, high = gap.interval

@@ -14,7 +14,7 @@ from dvl_calib_ros.diagnosis.answer.gap_location import places
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fit.cross_validation import held_out_deviance
-from dvl_calib_ros.diagnosis.fit.gauss_newton import SKIP_MARGIN, Fitter
+from dvl_calib_ros.diagnosis.fit.gauss_newton import EQUAL_DEVIANCE, Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import NuisanceFit
 from dvl_calib_ros.diagnosis.model.forward_model import make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
@@ -85,7 +85,7 @@ def test_what_a_step_from_a_fit_at_rest_promises_is_promised_of_no_hypothesis_ne
         return fitter._is_surely_worse(fit.hypothesis, looked, fit.noise, fit.deviance - by, promised)
 
     assert promised > 3.0 and not is_surely_worse(0.0, promised)
-    beyond = 2.0 * SKIP_MARGIN + 0.1
+    beyond = 2.0 * EQUAL_DEVIANCE + 0.1
     assert is_surely_worse(beyond, promised) and not is_surely_worse(beyond, 0.0)
 
 
@@ -170,7 +170,7 @@ def test_effects_that_an_unknown_cause_may_be_a_part_of_are_not_named_beside_it(
     base, fit = fitter.fit(no_effect(), noise), fitter.fit(start, noise)
     assert find_unexplained(fitter, fit).found
     selected = tuple(Selected(effect, -50.0, ()) for effect in effects)
-    left, rest = without_replaceable(EffectSelection(selected, base, fit, fitter, (), EFFECTS))
+    left, rest = without_replaceable(EffectSelection(selected, base, fit, fitter, EFFECTS))
     assert rest.about == "a step in time"
     assert [each.effect.name for each in left.selected] == ["lever_arm"] == [each.name for each in left.fit.effects]
 
@@ -201,7 +201,7 @@ def test_an_unknown_cause_takes_the_place_of_effects_only_where_it_predicts_bett
     monkeypatch.setattr(looking, "find_unexplained", lambda *_: cause)
     monkeypatch.setattr(looking, "_held_out_gain", lambda *_: better)
     selected = (Selected(drift, -50.0, ()),)
-    left, _ = without_replaceable(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS))
+    left, _ = without_replaceable(EffectSelection(selected, fit, fitted_with, fitter, EFFECTS))
     assert bool(left.selected) == kept
 
 
@@ -237,7 +237,7 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     cause = looking.Unexplained(-50.0, about, nothing, nothing)
     monkeypatch.setattr(looking, "find_unexplained", lambda *_: cause)
     monkeypatch.setattr(looking, "_held_out_gain", lambda *_: 1000.0)
-    left, _ = without_replaceable(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
+    left, _ = without_replaceable(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, EFFECTS))
     assert bool(left.selected) == is_some
 
 
