@@ -17,8 +17,6 @@ from ...calibration.numerics.distributions import normal_isf
 from ...calibration.numerics.frames import Array
 from .settings import SETTINGS
 
-# Largest exponent: if standard deviations are written as variances, the reported values are square roots
-MAX_EXPONENT = 2.0
 # Least standard deviation of the logarithm of reported values that is informative
 MIN_LOG_STD = 0.05
 
@@ -71,7 +69,7 @@ def relative_std(log_claims: Array, values: Array, names: Sequence[str], stretch
     while kept:
         found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
         if found.is_significant.all():
-            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, MAX_EXPONENT)
+            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ found.exponents
             return np.asarray(np.exp(logarithm))
         kept.pop(int(np.argmin(found.exponents / found.stds)))
     return np.ones(values.shape)
@@ -100,4 +98,4 @@ def relative_noise(time: Array, sample_std: Array | None, differences: Array, we
     if not found.is_significant.all():
         return np.ones(shape)
     median = np.median(sample_std, axis=0)
-    return np.asarray((sample_std / median) ** min(float(found.exponents[0]), MAX_EXPONENT))
+    return np.asarray((sample_std / median) ** float(found.exponents[0]))

@@ -17,9 +17,10 @@ from ...calibration.numerics.frames import ENU_FROM_NED, Array, cross, rotation_
 from ...calibration.numerics.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
 from ...calibration.registration.gauss_newton import white_noise
 from ...calibration.registration.registration import Registration
-from ...calibration.streams.clock_correction import Clocks
+from ...calibration.registration.unregistrable_clocks import MOVING_MPS
+from ...calibration.streams.clock_correction import SECOND_NS, Clocks
 from ...calibration.streams.position_velocities import NOISY_MPS
-from ...calibration.streams.screening import SMALLEST_VARIANCE
+from ...calibration.streams.screening import NOT_MEASURED_VARIANCE, SMALLEST_VARIANCE
 from ...calibration.streams.stream_order import strays
 from ...effects.base import EffectNeeds
 from ...errors import InputError
@@ -85,11 +86,10 @@ def backward_steps(time: Array, velocity: Array) -> tuple[tuple[BackwardStep, ..
     return tuple(events), is_unique
 
 
-SECOND_NS = 1_000_000_000
+# Standard deviation, m/s, from which an axis is unmeasured
+UNMEASURED_STD = math.sqrt(NOT_MEASURED_VARIANCE)
 # Suffixes of files that are recordings by themselves
 SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3", ".bag")
-# m/s; while the reference is faster than this, a DVL velocity of zero is a dropout
-MOVING_MPS = 0.1
 # Lowest rate of averaged streams, however long a recording is: one sample per shortest bin
 SLOWEST_AVERAGE_HZ = 1.0 / SETTINGS.shortest_bin
 # Samples of the reference per DVL sample that suffice for the comparison
@@ -240,10 +240,10 @@ def _rms(std: Array | None) -> Array | None:
     median = _usual(std)
     if std is None or median is None or std.ndim == 1:
         return std
-    known = std < SETTINGS.unmeasured_std
+    known = std < UNMEASURED_STD
     squares = np.where(known, std, 0.0) ** 2
     rms = np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1))
-    return np.where(median < SETTINGS.unmeasured_std, rms, median)
+    return np.where(median < UNMEASURED_STD, rms, median)
 
 
 def _with_reported(stream: tuple[Array, Array], std: Array | None) -> Curve:
@@ -251,9 +251,9 @@ def _with_reported(stream: tuple[Array, Array], std: Array | None) -> Curve:
     median = _usual(std)
     if std is None or median is None or std.ndim == 1:
         return Curve(*stream, std)
-    finite = np.where(np.isfinite(median), median, SETTINGS.unmeasured_std)
+    finite = np.where(np.isfinite(median), median, UNMEASURED_STD)
     sample_std = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
-    return Curve(*stream, median, sample_std=np.minimum(sample_std, SETTINGS.unmeasured_std))
+    return Curve(*stream, median, sample_std=np.minimum(sample_std, UNMEASURED_STD))
 
 
 def _continuous_sign(quaternions: Array) -> Array:
@@ -266,7 +266,7 @@ def _measured_axes(velocity: Array, std: Array | None, axes: str) -> tuple[bool,
     """Return the axes that a reference measures, by `gnss_axes` or by its reported σ."""
     if axes != "auto":
         return True, True, axes == "xyz"
-    measured = np.ones(3, dtype=bool) if std is None else std < SETTINGS.unmeasured_std
+    measured = np.ones(3, dtype=bool) if std is None else std < UNMEASURED_STD
     measured[2] &= bool(velocity[:, 2].any())
     return bool(measured[0]), bool(measured[1]), bool(measured[2])
 

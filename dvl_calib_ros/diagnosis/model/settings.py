@@ -11,8 +11,7 @@ class DiagnosisSettings:
 
     Reading: samples of a stream closer than 1 / max_stream_rate are averaged (effects lie below 1 Hz); a gap is longer
     than max_gap_intervals of a stream. own_rates_from: lowest rate of gyroscopes in use; at lower rates the derivative
-    of the attitude is better. unmeasured_std: standard deviation from which an axis is unmeasured (drivers write 1e3
-    (m/s)² and more).
+    of the attitude is better.
 
     Comparing: the residual is averaged over bins_per_interval intervals of the rougher stream, so that interpolation
     errors near its Nyquist frequency do not resemble a delay. Bins are at least shortest_bin long and at most max_bins
@@ -34,7 +33,6 @@ class DiagnosisSettings:
     max_stream_rate: float = 10.0
     max_gap_intervals: float = 3.5
     own_rates_from: float = 4.0
-    unmeasured_std: float = 31.0
     bins_per_interval: float = 2.0
     shortest_bin: float = 0.4
     max_bins: int = 12_000
