@@ -18,6 +18,8 @@ from .gauss_newton import Fit, Fitter
 from .selection_criteria import NuisanceFit, SlowNoiseOfFit
 
 Integers = NDArray[np.intp]
+# Steps of a fit that starts from the fit to all data
+FOLD_STEPS = 6
 
 
 def fitted_without(
@@ -33,7 +35,7 @@ def fitted_without(
     """
     for fold in np.unique(fold_of).tolist():
         train = fitter.without(fold_of == fold)
-        yield fold, [train.fit(each, noise, fixed=fixed) for each in hypotheses]
+        yield fold, [train.fit(each, noise, FOLD_STEPS, fixed=fixed) for each in hypotheses]
 
 
 def folds_of(problem: Problem) -> Integers:
