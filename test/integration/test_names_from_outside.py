@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import csv
 import io
 import json
@@ -12,7 +11,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import ROOT
 from fleet_fixtures import write_dive
 from io_fixtures import rewrite, run
 from report_fixtures import drawn
@@ -195,29 +193,6 @@ def test_texts_of_a_diagnosed_recording(tmp_path, capsys):
     """The shortest that is diagnosed, from a file of this name."""
     bag = write_dive(tmp_path / FILE, 0)
     assert SEEN.replace("/", "") in said(capsys, "diagnose", bag, "--json", tmp_path / f"{FILE}.json", codes=(0, 1))
-
-
-def test_only_two_functions_print():
-    """`standard_streams` prints lines, `common.console` makes the console: both print what is fit for a terminal."""
-    found = set()
-    for source in sorted((ROOT / "dvl_calib_ros").rglob("*.py")):
-        for node in ast.walk(ast.parse(source.read_text())):
-            name = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
-            if name in ("print", "Console", "RichConsole", "sys.stdout.write", "sys.stderr.write", "rich.print"):
-                found.add((source.relative_to(ROOT / "dvl_calib_ros").as_posix(), name))
-    assert found == {
-        ("standard_streams.py", "print"), ("cli/common.py", "Console"), ("api/output.py", "Console"),
-    }  # fmt: skip
-
-
-def test_the_node_logs_by_one_class_alone():
-    """Others may log a text that stands in the code, for rclpy's filters."""
-    found = []
-    for source in sorted((ROOT / "dvl_calib_ros").rglob("*.py")):
-        for node in ast.walk(ast.parse(source.read_text())):
-            if isinstance(node, ast.Call) and "get_logger()." in ast.unparse(node.func):
-                found += [source.name] if not isinstance(node.args[0], ast.Constant) else []
-    assert set(found) == {"services.py"}
 
 
 # ------------------------------------------------------------------ cells of spreadsheets

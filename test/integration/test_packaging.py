@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.util
 import re
 import runpy
@@ -38,29 +37,10 @@ def parts(version: str) -> list[int]:
     return [int(part) for part in version.split(".")]
 
 
-def imported() -> set[str]:
-    """Top names of what the package imports, anywhere."""
-    names = set()
-    for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                names |= {alias.name.partition(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
-                names.add(node.module.partition(".")[0])
-    return names
-
-
 def test_the_version_is_the_same_everywhere():
     (in_setup,) = re.findall(r"version=\"(\d+\.\d+\.\d+)\",", SETUP)  # the form that catkin_prepare_release looks for
     (to_cite,) = re.findall(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M)
     assert PACKAGE.findtext("version") == in_setup == to_cite == dvl_calib_ros.__version__
-
-
-def test_everything_that_is_imported_is_declared():
-    ours = {"dvl_calib_ros", "test", *sys.stdlib_module_names}
-    messages = {name for name in imported() if name.endswith(("_msgs", "_srvs", "_interfaces"))}
-    others = imported() - ours - messages - NOT_REQUIRED
-    assert {DISTRIBUTIONS.get(name, name) for name in others} - required().keys() == set()
 
 
 def test_the_lowest_versions_that_ci_tries_are_those_that_are_asked_for():

@@ -91,36 +91,29 @@ def test_a_linked_database_is_read_with_its_journal(tmp_path, journal):
     assert raw(link) == expected[:700]
 
 
-def hinder(bag: Path, name: str, what: str) -> None:
-    path = bag / name
-    if what == "a dangling link":
-        path.symlink_to(bag / "nowhere.mcap")
-    elif what == "a folder":
-        path.mkdir()
-    elif what == "a pipe":
-        os.mkfifo(path)
-    elif what == "a link to itself":
-        path.symlink_to(path)
-    else:
-        path.write_bytes(b"no bag")
-
-
-@pytest.mark.parametrize("what", ["a dangling link", "a folder", "a pipe", "a link to itself", "something else"])
 @pytest.mark.parametrize("is_listed", [False, True])
-def test_of_a_folder_with_something_that_cannot_be_read_the_rest_is_read_and_it_is_said(tmp_path, what, is_listed):
+def test_of_a_folder_with_what_cannot_be_read_the_rest_is_read_and_it_is_said(tmp_path, is_listed):
     bag = write_bag(tmp_path / "bag", run(6.0))
     expected = raw(bag)
-    for name in ("a.mcap", "z.mcap"):
-        hinder(bag, name, what)
+    hindrances = {
+        "a.mcap": lambda path: path.symlink_to(bag / "nowhere.mcap"),
+        "b.mcap": lambda path: path.symlink_to(path),
+        "x.mcap": Path.mkdir,
+        "y.mcap": os.mkfifo,
+        "z.mcap": lambda path: path.write_bytes(b"no bag"),
+    }
+    for name, hinder in hindrances.items():
+        hinder(bag / name)
     if is_listed:
-        text = (bag / "metadata.yaml").read_text()
-        (bag / "metadata.yaml").write_text(text.replace("  - bag.mcap", "  - a.mcap\n  - bag.mcap\n  - z.mcap"))
+        text, names = (bag / "metadata.yaml").read_text(), [*hindrances]
+        listed = "".join(f"  - {name}\n" for name in [*names[:2], "bag.mcap", *names[2:]])
+        (bag / "metadata.yaml").write_text(text.replace("  - bag.mcap\n", listed))
         assert "z.mcap" in (bag / "metadata.yaml").read_text()
     else:
         (bag / "metadata.yaml").unlink()
     found, notes = raw_and_notes(bag)
     assert found == expected
-    for name in ("a.mcap", "z.mcap"):
+    for name in hindrances:
         assert sum(name in note and "the rest is read" in note for note in notes) == 1
     assert main(["replay", str(bag), "-p", "model:=M3"]) == 0
 
@@ -283,10 +276,6 @@ def test_salvage_of_a_bag_without_definitions_writes_none(tmp_path):
             "geometry_msgs/TwistWithCovarianceStamped again\n",
             "geometry_msgs/msg/TwistWithCovarianceStamped contains itself",
         ),
-        (
-            "geometry_msgs/TwistWithCovarianceStamped[] again\n",
-            "geometry_msgs/msg/TwistWithCovarianceStamped contains itself",
-        ),
         (f"a/B2 x\n{'=' * 80}\nMSG: a/B2\na/B3[2] y\n{'=' * 80}\nMSG: a/B3\na/B2 z\n", "a/msg/B2 contains itself"),
         (
             "a/N0 x\n" + "".join(f"{'=' * 80}\nMSG: a/N{i}\na/N{i + 1} x\na/N{i + 1} y\n" for i in range(30)),
@@ -309,8 +298,8 @@ def big_endian(topic: str, data: bytes) -> bytes:
 
 @pytest.mark.parametrize(
     "change",
-    [big_endian, lambda _, data: data + bytes(4), lambda _, data: data + bytes(8)],
-    ids=["big-endian", "4 bytes of padding", "8 bytes of padding"],
+    [big_endian, lambda _, data: data + bytes(4)],
+    ids=["big-endian", "4 bytes of padding"],
 )
 def test_messages_in_big_endian_or_with_padding_are_read_as_they_are(tmp_path, change):
     samples = raw(write_bag(tmp_path / "bag", run(20.0)))
@@ -323,9 +312,7 @@ def test_messages_in_big_endian_or_with_padding_are_read_as_they_are(tmp_path, c
     ("change", "reason"),
     [
         (lambda data: data + b"\xff" * 4, "it is longer than a sensor_msgs/msg/Imu"),
-        (lambda data: data + b"\xff" * 100, "it is longer than a sensor_msgs/msg/Imu"),
         (lambda data: b"\0\7" + data[2:], "it begins with 00 07, plain CDR with 00 00 or 00 01"),
-        (lambda data: b"abcd" + data[4:], "it begins with 61 62, plain CDR"),
         (lambda data: data[:60], "Could not deserialize"),
     ],
 )
@@ -414,8 +401,14 @@ def test_what_a_damaged_definition_makes_of_messages_is_told_of_each():
                 assert str(error)
 
 
-@pytest.mark.parametrize("options", [{}, {"use_chunking": False}])
-@pytest.mark.parametrize("log_times", [(5, 2**64 - 1, 2**63, 7), (2**64 - 1,) * 4, (2**63 - 1,) * 4])
+@pytest.mark.parametrize(
+    ("log_times", "options"),
+    [
+        ((5, 2**64 - 1, 2**63, 7), {}),
+        ((5, 2**64 - 1, 2**63, 7), {"use_chunking": False}),
+        ((2**63 - 1,) * 4, {}),
+    ],
+)
 def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path, log_times, options):
     messages = [("dvl/twist", log_ns, data) for log_ns, (_, _, data) in zip(log_times, raw_twists(), strict=True)]
     (tmp_path / "wild.mcap").write_bytes(mcap_bytes(messages, **options))

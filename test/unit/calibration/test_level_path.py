@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from runs import START_NS
+from runs import START_NS, calibrate
 
-from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -33,12 +32,13 @@ def pitch_found(climb, error_up: float) -> tuple[float, float]:
     rates = np.vstack([rates, rates[-1:]])
     dvl = body @ rotation_from_rpy((ROLL, PITCH, YAW)) + rng.normal(0.0, 0.01, body.shape)
     reference = earth + np.array([0.0, 0.0, error_up]) + rng.normal(0.0, 0.02, earth.shape)
-    calibrator = Calibrator(Parameters(), block_size=256)
+    samples: list[DvlSample | ReferenceSample | ImuSample] = []
     for at in range(len(time)):
         stamp = START_NS + round(1e9 * time[at])
-        calibrator.feed_imu(ImuSample(stamp, quaternion_from_rotation(turns[at]), tuple(rates[at])))
-        calibrator.feed_reference(ReferenceSample(stamp, tuple(reference[at]), None, VelocityFrame.ENU))
-        calibrator.feed_dvl(DvlSample(stamp + 1000, tuple(dvl[at])))
+        samples.append(ImuSample(stamp, quaternion_from_rotation(turns[at]), tuple(rates[at])))
+        samples.append(ReferenceSample(stamp, tuple(reference[at]), None, VelocityFrame.ENU))
+        samples.append(DvlSample(stamp + 1000, tuple(dvl[at])))
+    calibrator = calibrate(samples, Parameters())
     calibrator.finish()
     estimate = calibrator.result().estimate
     return math.degrees(-estimate.misalignment[1] - PITCH), math.degrees(estimate.recording_std[1])

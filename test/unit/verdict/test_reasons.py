@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ast
 import json
-import string
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,33 +11,6 @@ from documentation import section
 
 from dvl_calib_ros.verdict.kinds import Kind, Severity
 from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, full, lookup, of_consequence
-
-PACKAGE = ROOT / "dvl_calib_ros"
-MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent.name != "verdict"]
-
-
-def fields(kind: Kind) -> set[str]:
-    """What has to be put into its sentences."""
-    parsed = string.Formatter().parse(kind.says + kind.remedy)
-    return {name for _, name, _, _ in parsed if name}
-
-
-@cache
-def nodes() -> list[ast.AST]:
-    """All of the package's code."""
-    return [node for path in MODULES for node in ast.walk(ast.parse(path.read_text()))]
-
-
-def literal_calls() -> list[tuple[str, set[str], bool]]:
-    """(code, keywords, whether there are others by **) of each call of `finding` with a code in place."""
-    found = []
-    for node in nodes():
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "finding":
-            first = node.args[0]
-            if isinstance(first, ast.Constant):
-                names = {keyword.arg for keyword in node.keywords if keyword.arg}
-                found.append((first.value, names, any(keyword.arg is None for keyword in node.keywords)))
-    return found
 
 
 def test_a_finding_says_what_is_wrong_what_to_do_and_its_code():
@@ -53,19 +23,6 @@ def test_a_finding_says_what_is_wrong_what_to_do_and_its_code():
 def test_an_unknown_code_or_a_missing_field_is_an_error_of_the_program(code, given):
     with pytest.raises(KeyError):
         finding(code, **given)
-
-
-def test_every_call_gives_its_entry_exactly_the_fields_it_has():
-    calls = literal_calls()
-    assert len(calls) > 25
-    for code, names, more in calls:
-        wanted = fields(KINDS[code])
-        assert names <= wanted and (more or names == wanted), code
-
-
-def test_every_entry_of_the_table_is_said_somewhere():
-    constants = {node.value for node in nodes() if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    assert [code for code in KINDS if code not in constants] == []
 
 
 @pytest.mark.parametrize("code", ["lower_case", "WITH SPACE", ""])
