@@ -336,25 +336,24 @@ def test_why_a_dvl_cannot_be_decoded_is_said_where_none_is_found(tmp_path, capsy
     assert f"a50/velocity ({TWIST_TYPE}, which cannot be decoded: it begins with 00 07" in error
 
 
-@pytest.mark.parametrize(("msgtype", "text"), [(TWIST_TYPE, STANDARD), ("std_msgs/msg/String", "string data\n")])
-def test_thousands_of_channels_are_opened_in_a_time_that_goes_with_their_number(tmp_path, msgtype, text):
+def test_thousands_of_channels_are_opened_in_a_time_that_goes_with_their_number(tmp_path):
     output = io.BytesIO()
     writer = McapWriter(output)
     writer.start("ros2")
-    schema = writer.register_schema(msgtype, "ros2msg", text.encode())
-    channels_ = [writer.register_channel(f"t{number}", "cdr", schema) for number in range(20_000)]
+    schema = writer.register_schema(TWIST_TYPE, "ros2msg", STANDARD.encode())
+    channels_ = [writer.register_channel(f"t{number}", "cdr", schema) for number in range(10_000)]
     for _, log_ns, data in raw_twists():
         writer.add_message(channels_[7], log_ns, data, log_ns)
     writer.finish()
     (tmp_path / "many.mcap").write_bytes(output.getvalue())
     began = time.process_time()
     with open_bags([tmp_path / "many.mcap"]) as bag:
-        assert len(bag.topics) == 20_000
+        assert len(bag.topics) == 10_000
         assert all(len(bag.types_of(topic)) == 1 and not bag.lacks_definition(topic) for topic in bag.topics)
         assert len(list(bag.messages(bag.topics))) == 4
     recording = open_recording([tmp_path / "many.mcap"])
-    assert len(recording.types) == 20_000
-    assert time.process_time() - began < 7.0  # without an index it grows with the square
+    assert len(recording.types) == 10_000
+    assert time.process_time() - began < 3.5  # without an index it grows with the square
 
 
 # ---------------------------------------------------------------------- what is no damage

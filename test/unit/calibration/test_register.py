@@ -281,7 +281,7 @@ def _of_its_own(one: MotionStreams) -> MotionStreams:
 
 
 MIRRORED = {
-    (1.0, 1.0, 1.0): None, (1.0, -1.0, 1.0): "y", (1.0, 1.0, -1.0): "z", (-1.0, -1.0, -1.0): "each of x, y and z",
+    (1.0, 1.0, 1.0): None, (1.0, -1.0, 1.0): "y", (-1.0, -1.0, -1.0): "each of x, y and z",
 }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
 
-DRAWS = 40
+DRAWS = 20
 BIAS = np.array([0.036, -0.027, 0.018])
 
 
