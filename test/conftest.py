@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping
 from enum import Enum
 from functools import wraps
 from pathlib import Path
@@ -33,7 +33,9 @@ from hypothesis import HealthCheck, settings
 
 from dvl_calib_ros.calibration.estimators import registration_schedule
 from dvl_calib_ros.calibration.registration.frame_hypotheses import Readings
+from dvl_calib_ros.diagnosis import diagnose
 from dvl_calib_ros.discovery import clock_offsets
+from dvl_calib_ros.unpaired import both_sides
 
 # A busy machine takes its time over an example. Who waits for the suite sees fewer of them than CI, and both the same
 # ones each time, so that what fails is what was changed; who searches for new ones takes --hypothesis-profile=search.
@@ -132,12 +134,13 @@ def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
     answers: dict[bytes, Any] = {}
 
     @wraps(function)
-    def remembering(*arguments: Any) -> Any:
+    def remembering(*arguments: Any, **named: Any) -> Any:
         digest = hashlib.sha1()
         _add_to(digest, arguments)
+        _add_to(digest, tuple(sorted(named.items())))
         key = digest.digest()
         if key not in answers:
-            answers[key] = function(*arguments)
+            answers[key] = function(*arguments, **named)
         return answers[key]
 
     return remembering
@@ -146,14 +149,16 @@ def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
 def _add_to(digest: Any, value: Any) -> None:
     if isinstance(value, np.ndarray):
         digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, tuple):
+    elif isinstance(value, tuple | list):
         digest.update(f"({len(value)}".encode())
         for each in value:
             _add_to(digest, each)
     elif isinstance(value, Readings):
         _add_to(digest, (value._motion, value._position))
+    elif isinstance(value, Mapping):  # effects: those of the library are there once
+        _add_to(digest, tuple((name, id(each)) for name, each in value.items()))
     elif dataclasses.is_dataclass(value):
-        _add_to(digest, tuple(getattr(value, field.name) for field in dataclasses.fields(value)))
+        _add_to(digest, tuple(getattr(value, field.name) for field in dataclasses.fields(value) if field.init))
     else:
         assert value is None or isinstance(value, str | int | float | Enum | np.generic), type(value)
         digest.update(f"{value!r},".encode())
@@ -163,6 +168,8 @@ def _add_to(digest: Any, value: Any) -> None:
 # itself import it from where it is.
 registration_schedule.register = clock_offsets.register = remembered(registration_schedule.register)
 registration_schedule.fitting_configuration = remembered(registration_schedule.fitting_configuration)
+# All of `diagnose` but reading: its options, pages and comparisons are tested with the same few recordings.
+diagnose.diagnose_recordings = both_sides.diagnose_recordings = remembered(diagnose.diagnose_recordings)
 for _method in ("registered", "are_axes_mirrored"):
     setattr(Readings, _method, remembered(getattr(Readings, _method)))
 
