@@ -43,7 +43,7 @@ settings.register_profile(
     "patient", deadline=None, max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.register_profile("brief", settings.get_profile("patient"), max_examples=10)  # versions that differ little
-settings.register_profile("ci", settings.get_profile("patient"), max_examples=200)
+settings.register_profile("ci", settings.get_profile("patient"), max_examples=100)
 settings.register_profile("search", settings.get_profile("ci"), max_examples=2000, derandomize=False)
 settings.load_profile("patient")
 ROOT = Path(__file__).resolve().parents[1]
