@@ -120,7 +120,7 @@ def test_texts_of_a_result_file(result, command, tmp_path, capsys):
     more = {"apply": (), "compare": (result,), "export": ("-o", tmp_path / f"{FILE}.sdf")}[command]
     texts = [*with_each_text({name: each for name, each in content.items() if name != "models"})]
     assert len(texts) > 30
-    for changed in texts[:: 1 if command == "apply" else 4]:  # one function prints for all commands
+    for changed in texts[:: 1 if command == "apply" else 12]:  # one function prints for all commands
         path.write_text(result_text({**changed, "models": content["models"]}))
         said(capsys, command, *(["gazebo"] if command == "export" else []), path, *more)
 

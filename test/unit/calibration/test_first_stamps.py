@@ -17,7 +17,7 @@ from dvl_calib_ros.calibration.streams.stream_order import Order, Sequencer
 
 S, DAY = 10**9, 86_400 * 10**9
 IN_1970, IN_2038 = 5 * S, 2_145_916_800 * S
-SECONDS = 30.0
+SECONDS = 20.0
 
 
 def fed(samples) -> tuple[Calibrator, int]:

@@ -62,7 +62,7 @@ def peak(run) -> int:
     return most
 
 
-@pytest.mark.parametrize("pause_s", [0.0, 6 * 3600.0, YEAR_S])
+@pytest.mark.parametrize("pause_s", [0.0, YEAR_S])
 def test_clocks_that_are_far_apart_are_found_across_a_pause(pause_s):
     found = far_clocks(motion(200.0, pause_s), np.eye(3))
     assert found is not None

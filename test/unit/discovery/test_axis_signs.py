@@ -39,8 +39,7 @@ def reasons_of(calibration):
     return calibration.replayed.result.verifications[calibration.model].reasons
 
 
-@pytest.mark.parametrize("mounting", [(0.0, 0.0, 0.0), ASTERN])
-@pytest.mark.parametrize("signs", [(1.0, -1.0, 1.0), (1.0, -1.0, -1.0)])
+@pytest.mark.parametrize(("signs", "mounting"), [((1.0, -1.0, 1.0), ASTERN), ((1.0, -1.0, -1.0), (0.0, 0.0, 0.0))])
 def test_a_sway_that_a_current_contradicts_is_rejected_and_its_remedy_works(tmp_path, signs, mounting):
     wrong = recording(tmp_path / "wrong", signs, mounting=mounting)
     examined, calibration = dc.doctor(wrong), dc.replay(wrong, history=False)
@@ -57,9 +56,8 @@ def test_a_sway_that_a_current_contradicts_is_rejected_and_its_remedy_works(tmp_
     assert mended.verdict != "reject" and "DVL_SIDE_INVERTED" not in codes(reasons_of(mended))
 
 
-@pytest.mark.parametrize("seed", [4, 5, 6])
-def test_a_current_confirms_the_sign_of_y_and_that_of_z_is_asked(tmp_path, seed):
-    examined = dc.doctor(recording(tmp_path / "bag", (1.0, 1.0, 1.0), seed=seed))
+def test_a_current_confirms_the_sign_of_y_and_that_of_z_is_asked(tmp_path):
+    examined = dc.doctor(recording(tmp_path / "bag", (1.0, 1.0, 1.0)))
     (question,) = [each for each in examined.reasons if each.code.startswith("DVL_SI")]
     assert question.code == "DVL_SIGN_OPEN" and question.numbers["axis"] == "z"
     assert float(question.numbers["effect"].removeprefix("the pitch changes by ")[:-1]) == pytest.approx(2.0, abs=0.3)

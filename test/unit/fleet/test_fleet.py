@@ -447,11 +447,11 @@ def test_workers_end_with_a_parent_that_is_killed():
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_at_any_moment_is_gone_on_with(dives, tmp_path):
-    """SIGKILL at four moments, each run going on with the one before; no row is lost, none is there twice."""
-    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 6), tmp_path / "out"
+    """SIGKILL at three moments, each run going on with the one before; no row is lost, none is there twice."""
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 4), tmp_path / "out"
     command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "fleet", str(place), "--out", str(out), "--jobs", "2"]
     rng, seen = np.random.default_rng(4), 0
-    for _ in range(4):
+    for _ in range(3):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(rng.uniform(0.5, 5.0))
         ended = process.poll() is not None
@@ -461,13 +461,13 @@ def test_a_run_that_is_killed_at_any_moment_is_gone_on_with(dives, tmp_path):
             whole = [parquet.read_table(path).num_rows for path in (out / "rows").glob("*.parquet")]
             assert all(rows > 1 for rows in whole) and len(whole) >= seen
             seen = len(whole)
-        if ended and seen == 6:
+        if ended and seen == 4:
             break
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     rows = table(out)
-    assert rows.recording.nunique() == 6 and not rows.duplicated(["recording", "parameter"]).any()
+    assert rows.recording.nunique() == 4 and not rows.duplicated(["recording", "parameter"]).any()
     assert rows.groupby("recording").size().nunique() == 1
-    assert list((out / "rows").glob("*.parquet")) and len(list((out / "rows").iterdir())) == 6
+    assert list((out / "rows").glob("*.parquet")) and len(list((out / "rows").iterdir())) == 4
 
 
 @pytest.mark.slow
@@ -498,14 +498,14 @@ def test_workers_of_a_cluster_that_are_killed_cost_no_row(dives, tmp_path):
 
 @pytest.mark.slow
 def test_four_times_the_recordings_take_no_more_memory(dives, tmp_path):
-    """Neither here nor in a worker, of which two have eight each: what one keeps shows in its own largest."""
+    """Neither here nor in a worker, of which two have four each: what one keeps shows in its own largest."""
     script = (
         "import resource, json, sys; from dvl_calib_ros.cli.main import main; "
         "code = main(['fleet', *sys.argv[1:], '--jobs', '2']); u = [resource.getrusage(who) for who in "
         "(resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]; print(json.dumps([code, u[0].ru_maxrss, u[1].ru_maxrss]))"
     )
     largest = {}
-    for name, count in (("few", 4), ("many", 16)):
+    for name, count in (("few", 2), ("many", 8)):
         place = copies(tmp_path / f"dives_{name}", dives / "auv1" / "dive0", count)
         done = subprocess.run(
             [sys.executable, "-c", script, str(place), "--out", str(tmp_path / name)],
@@ -513,6 +513,6 @@ def test_four_times_the_recordings_take_no_more_memory(dives, tmp_path):
         )  # fmt: skip
         code, *largest[name] = json.loads(done.stdout.splitlines()[-1])
         assert code == 0
-    assert table(tmp_path / "many").recording.nunique() == 16
+    assert table(tmp_path / "many").recording.nunique() == 8
     for few, many in zip(largest["few"], largest["many"], strict=True):
         assert many < 1.08 * few

@@ -44,8 +44,7 @@ def write_poses(path, kind: str, imu: str = "none", *, turns: bool = True):
     return path / "bag", np.array([(w.x, w.y, w.z) for w in rates])
 
 
-@pytest.mark.parametrize("kind", POSE_TYPES)
-@pytest.mark.parametrize("imu", ["none", "raw"])
+@pytest.mark.parametrize(("kind", "imu"), [*zip(POSE_TYPES, ("none", "raw"), strict=True)])
 def test_without_an_orientation_of_an_imu_that_of_the_poses_is_taken(tmp_path, kind, imu):
     bag, expected = write_poses(tmp_path, kind, imu)
     recording = open_recording([bag])
