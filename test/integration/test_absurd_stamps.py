@@ -108,6 +108,7 @@ def verdicts(found: dict[str, Any]) -> tuple[str, str, str]:
     return found["doctor"]["verdict"], replayed["verification"][model]["verdict"], found["diagnose"]["verdict"]
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("case", CASES)
 def test_the_commands_say_what_they_say_without_it(tmp_path, messages, case, capsys):
     change, aside = CASES[case]

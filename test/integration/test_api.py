@@ -179,6 +179,7 @@ def test_bags_are_compared_as_result_files_are(calibration, later, tmp_path):
     assert found.word in ("same", "suspicious", "moved")
 
 
+@pytest.mark.slow
 def test_the_picture_states_the_sigma_of_the_mounting():
     calibration = dc.replay(ROOT / "bags" / "harbour_box")  # of which the next recording's yaw is known half as well
     legend = [text.get_text() for text in calibration.plot().axes[0].get_legend().get_texts()]

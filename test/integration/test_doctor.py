@@ -259,7 +259,7 @@ def test_of_a_horizontal_reference_no_roll_or_pitch_is_promised_as_none_is_claim
     assert {each.axis for each in claimed if each.missing == MEASURES_VERTICAL} == {"roll", "pitch"}
 
 
-@pytest.mark.spread(3)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("sound", SOUND_RUNS)
 def test_nothing_is_found_wrong_with_a_sound_recording(sound, tmp_path):
     examined = examine([simulated(tmp_path / "bag", **SOUND_RUNS[sound])], Parameters())
@@ -302,6 +302,7 @@ def test_nothing_is_observable_without_a_sample_and_the_next_command_keeps_the_o
     assert commands and all("-p min_speed:=4.9" in command for command in commands)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("variance", [-1.0, 0.0, math.nan])
 def test_of_positions_with_variances_that_are_none_no_error_is_claimed(variance, tmp_path, capsys):

@@ -45,6 +45,7 @@ def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_de
     assert text.count("<img") == 4 and "Track, monday" in text and "Error of position, tuesday" in text
 
 
+@pytest.mark.slow
 def test_topics_are_found_as_by_replay_and_the_answer_is_said_first_with_warnings_of_the_models_asked_for(
     bags, tmp_path, capsys
 ):

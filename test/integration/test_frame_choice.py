@@ -153,6 +153,7 @@ def test_a_reference_in_north_west_up_is_turned_not_the_dvl(tmp_path):
     assert is_right(replay(bag), truth_deg())
 
 
+@pytest.mark.slow
 def test_two_negated_axes_are_a_mounting_or_the_drivers(tmp_path):
     """Of a vehicle that heaves."""
     told = Told(motion=long_motion())

@@ -101,6 +101,7 @@ def test_whatever_is_typed_ends_with_success_or_one_line_and_exit_code_2(tmp_pat
     assert code == 0 or errors.getvalue().count("\n") == 1
 
 
+@pytest.mark.spread(8)
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_fuzz_target_takes_its_seeds_what_was_found_and_some_damage(name):
     target = TARGETS[name]

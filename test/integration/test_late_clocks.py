@@ -93,6 +93,7 @@ def test_what_the_user_gives_stands(tmp_path):
     assert discover([bag], parameters, given).parameters.reference_time_offset == 5.0
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_off_beside_the_log_is_taken_off_and_no_reason_against_the_recording(tmp_path, capsys):
     """Doctor said that the stamps had to be corrected; replay had done so."""
     errors = DvlErrors((0.01, -0.01, 0.02), (0.003,) * 3, beam_std=0.005)

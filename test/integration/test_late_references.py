@@ -49,6 +49,7 @@ def bag_of(folder, reference_s=0.0, dvl_s=0.0, arm_m=0.0, hz=5):
     return write_bag(folder / "late", heapq.merge(imu, gnss, dvl, key=lambda sample: sample.stamp_ns))
 
 
+@pytest.mark.slow
 def test_doctor_replay_and_diagnose_agree_on_how_late_a_reference_is(tmp_path, capsys):
     """Diagnose could not tell the clock from a lever arm, which registration rules out by a chi-square of 300."""
     seconds = 7.5
@@ -68,6 +69,7 @@ def test_doctor_replay_and_diagnose_agree_on_how_late_a_reference_is(tmp_path, c
     assert low < seconds < high and high - low < 0.1
 
 
+@pytest.mark.slow
 def test_an_arm_that_one_sample_a_second_hardly_shows_is_not_ruled_out_by_the_clock(tmp_path):
     """The likelihood calls for the arm, the scatter of blocks does not: the clock alone would be wrong."""
     diagnosed = dc.diagnose(bag_of(tmp_path, reference_s=2.5, arm_m=0.3, hz=1))

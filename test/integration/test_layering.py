@@ -136,7 +136,7 @@ def test_blank_lines_comments_and_docstrings_are_no_code():
     assert rooms.lines_of_code(text) == 5
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("command", "slow"),
     [

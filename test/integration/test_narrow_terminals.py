@@ -108,6 +108,7 @@ def test_a_recording_too_short_to_diagnose_is_exit_code_1(monkeypatch, capsys, f
     assert capsys.readouterr().out.startswith("insufficient_excitation: ")
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("command", ["replay", "doctor", "diagnose"])
 def test_the_verdict_is_the_first_line_and_warnings_break_between_words(folder, command, monkeypatch, capsys):
     arguments = command, "two", "-p", "gnss_frame:=body"

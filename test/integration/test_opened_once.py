@@ -73,7 +73,7 @@ REGISTERED = {
 }  # fmt: skip
 
 
-@pytest.mark.spread(3)
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     "words",
     [

@@ -111,6 +111,7 @@ def test_a_pose_is_discovered_only_where_its_name_says_that_it_was_measured(tmp_
     assert discover(open_recording([other]), Parameters()).topics.gnss != "/navigator/pose"
 
 
+@pytest.mark.slow
 def test_a_usbl_that_gives_a_position_each_10_s_is_discovered_and_calibrated_with(tmp_path, capsys):
     bag = write_positions(tmp_path / "bag", run(seconds=900.0, fix_s=10.0))
     found = dc.replay(bag, history=False)
@@ -128,6 +129,7 @@ def test_half_a_minute_of_a_slow_usbl_which_a_live_node_looks_through_is_enough_
     assert discover(open_recording([bag]), Parameters()).topics.gnss == USBL
 
 
+@pytest.mark.slow
 def test_a_diagnosis_of_noisy_positions_says_what_to_do(usbl):
     assert any("replay calibrates with them (model positions)" in each for each in dc.diagnose(usbl).notes)
 

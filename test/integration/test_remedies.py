@@ -186,7 +186,7 @@ def judged(bag: Path, case: Case, **parameters: Any) -> Result:
     return replay([bag], Parameters(**{**case.given, **parameters})).result
 
 
-@pytest.mark.spread(4)
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(("code", "name"), CASES)
 def test_the_options_of_a_remedy_improve_the_verdict_and_set_something_new(code, name, tmp_path):
     case = CASES[code, name]
@@ -211,7 +211,7 @@ def codes_of(calibration: dc.Calibration) -> set[str]:
     return {each.code for each in causes([*reasons, *calibration.discovery.contradictions])}
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("code", FAULTS)
 def test_a_fault_that_is_named_and_mended_is_not_named_again(code, mended, tmp_path):
     found = dc.replay(with_fault(tmp_path / "bag", *FAULTS[code]), history=False)
@@ -222,6 +222,7 @@ def test_a_fault_that_is_named_and_mended_is_not_named_again(code, mended, tmp_p
     assert mended.verdict == "accept" and code not in codes_of(mended)
 
 
+@pytest.mark.slow
 def test_either_part_of_a_recording_that_is_cut_at_a_step_of_a_clock_is_calibrated_with(tmp_path):
     bag = with_fault(tmp_path / "bag", *FAULTS["CLOCK_LEAPS"])
     (step,) = [each for each in dc.replay(bag, history=False).discovery.contradictions if each.code == "CLOCK_LEAPS"]

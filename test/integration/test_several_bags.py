@@ -70,6 +70,7 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     assert "the mounting differs" in fail(capsys, "apply", tmp_path / "r.yaml", "--launch", tmp_path / "x.xml")
 
 
+@pytest.mark.slow
 def test_a_mounting_that_moved_is_not_hidden_by_the_bias_of_the_dvl(place):
     """10 mm/s are 0.6° at 1 m/s, on every day the same."""
     biased = Parameters(dvl_bias_std=0.01)

@@ -75,6 +75,7 @@ def test_a_reference_that_is_to_be_ignored_is_not_missed(tmp_path):
     assert "BAG_NO_GNSS" not in {each.code for each in calibration.findings}
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (0.3, 0.0, -0.5), (1.0, 0.0, 0.0)])
 def test_without_turn_rates_sigma_includes_what_a_lever_arm_makes(tmp_path, monkeypatch, arm):
     """Of an INS's body velocity alone roll was 7.2° ± 1.6 for 0.7, and yaw 3.9° ± 0.3 for 1.5."""

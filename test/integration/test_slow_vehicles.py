@@ -13,6 +13,7 @@ import dvl_calib_ros as dc
 SCALE = 0.015
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("speed", [0.305, 0.15])
 def test_a_vehicle_near_and_below_min_speed_gets_the_scale_of_its_dvl(tmp_path, speed):
     """Of samples selected by the reference's noise the scale was too small by several σ; 0.15 m/s were rejected."""

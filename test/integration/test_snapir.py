@@ -121,6 +121,7 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
     assert selected.count("unaided") >= 9
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("name", ["T05", "T13"])
 def test_an_ins_that_lags_half_a_second_is_no_filter_of_the_dvl(snapir_ins, tmp_path, name):
     """T05 shows an arm of 1.6 m, and T13 no angle that could be off: neither has been found to have nothing wrong."""

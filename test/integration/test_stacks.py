@@ -168,6 +168,7 @@ def test_the_answer_says_what_was_found_the_mounting_to_paste_and_what_to_type(b
     assert document["discovery"]["topics"]["gnss"] == "/ins/velocity"
 
 
+@pytest.mark.slow
 def test_from_a_bare_bag_to_an_applied_urdf_in_three_commands(bags, capsys, tmp_path):
     from stacks import URDF_45
 

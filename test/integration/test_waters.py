@@ -48,6 +48,7 @@ def test_a_replay_says_the_scale_in_its_cause_and_what_to_set(bag, tmp_path, cap
     assert written["water"].keys() == SCHEMA["properties"]["water"]["properties"].keys()
 
 
+@pytest.mark.slow
 def test_an_unknown_salinity_is_said_as_a_range(tmp_path, capsys):
     bag = with_water(tmp_path / "bag", salinity=float("nan"))
     said, _ = succeed(capsys, "replay", bag, *UNBIASED)
@@ -55,6 +56,7 @@ def test_an_unknown_salinity_is_said_as_a_range(tmp_path, capsys):
     assert "and unknown salinity (0 to 40 PSU)" in told and "if the salinity is" in told
 
 
+@pytest.mark.slow
 def test_a_recording_without_water_says_nothing(tmp_path):
     imu, gnss, dvl = dive()
     bag = write_bag(tmp_path / "bag", sorted((*imu, *gnss, *dvl), key=lambda sample: sample.stamp_ns))

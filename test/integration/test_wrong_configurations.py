@@ -171,6 +171,7 @@ def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_ref
     assert "--force" in capsys.readouterr().err
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     "samples", [run, lambda: run(frame=BODY), lambda: run(trajectory="box")], ids=["figure8", "body", "box"]
 )

@@ -68,6 +68,7 @@ def test_topics_that_nobody_named_are_found_and_calibrated_with(world, tmp_path)
     assert "DVL /a50/velocity (TwistWithCovarianceStamped" in node.output and "reference /gps" in node.output
 
 
+@pytest.mark.slow
 def test_the_unknown_frame_of_a_reference_is_chosen_by_the_data_as_in_a_replay(world, tmp_path):
     def in_gps(topic, message):
         if topic == "gnss/twist":

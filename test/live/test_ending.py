@@ -144,6 +144,7 @@ def test_an_interrupt_under_data_cuts_no_sample_short_so_the_saved_result_is_a_r
     assert_agree(document, Offline(Parameters(**given)).feed(left).calibrator.result())
 
 
+@pytest.mark.slow
 def test_a_view_that_is_killed_takes_its_node_with_it_and_the_node_saves(world, tmp_path):
     saved = tmp_path / "result.yaml"
     environment = os.environ | {"ROS_DOMAIN_ID": str(world.domain), "PYTHONPATH": str(ROOT)}

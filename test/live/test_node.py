@@ -342,6 +342,7 @@ def test_whole_numbers_are_accepted_for_doubles_in_a_file_and_live(world, tmp_pa
         assert "read-only" in world.set_parameter("min_speed", 2).reason
 
 
+@pytest.mark.slow
 def test_at_200_hz_each_sample_is_counted_in_one_place_at_any_time(world, tmp_path):
     account_at_200_hz(world, tmp_path, 1000)
 

@@ -147,6 +147,7 @@ def test_the_node_takes_the_mounting_of_a_played_tf_static_as_replay_does(world,
     assert "apt install ros-jazzy-tf2-msgs" in said
 
 
+@pytest.mark.slow
 def test_who_comes_late_hears_the_recorded_description_with_the_transforms_as_joints(world, mounted, monkeypatch):
     monkeypatch.setitem(sys.modules, "tf2_msgs", None)
     heard: list = []

@@ -453,6 +453,7 @@ def test_q_does_not_replace_a_good_result_by_a_few_samples_without_asking(world,
     assert "is kept, because it is better" in last
 
 
+@pytest.mark.slow
 def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_running(world):
     with world.calibration_node() as node:
         watching = subprocess.Popen(

@@ -94,6 +94,7 @@ def told_of_the_dvl(topics: dict[str, tuple[list[int], list[object]]]) -> tuple[
     return place, Rotation.from_euler("xyz", rpy)
 
 
+@pytest.mark.spread(5)
 @pytest.mark.parametrize("name", CHOSEN)
 def test_without_noise_a_bag_holds_what_the_truth_predicts(tmp_path, name):
     case: Case = next(case for case in map(draw, range(400)) if CHOSEN[name](case))

@@ -336,6 +336,7 @@ def test_why_a_dvl_cannot_be_decoded_is_said_where_none_is_found(tmp_path, capsy
     assert f"a50/velocity ({TWIST_TYPE}, which cannot be decoded: it begins with 00 07" in error
 
 
+@pytest.mark.slow
 def test_thousands_of_channels_are_opened_in_a_time_that_goes_with_their_number(tmp_path):
     output = io.BytesIO()
     writer = McapWriter(output)

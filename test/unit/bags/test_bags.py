@@ -81,6 +81,7 @@ def test_a_damaged_metadata_file_costs_nothing_but_a_note(tmp_path, plain, text)
     assert "metadata.yaml" in notes[0]
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(("storage", "split"), [("mcap", 1), ("sqlite3", 500), ("mcap", 1234)])
 def test_two_halves_of_a_run_give_the_same_as_the_whole_in_either_order(tmp_path, expected, storage, split):
     first = write_bag(tmp_path / "first", run()[:split], storage)

@@ -302,6 +302,7 @@ def lz4_zeros(size: int) -> bytes:
     return b"".join([begin, *(compressor.compress(bytes(10**7)) for _ in range(size // 10**7)), compressor.flush()])
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("claimed", [1000, 2_500_000_000])
 @pytest.mark.parametrize("compression", [LZ4, ZSTD])
 def test_a_chunk_that_unpacks_to_gigabytes_takes_no_memory(tmp_path, compression, claimed):
@@ -518,6 +519,7 @@ def test_zeros_are_passed_without_looking_at_each(tmp_path, place, monkeypatch):
     assert looked < 1000 and len(notes) == 1
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
 def test_salvage_writes_all_topics_with_their_definitions_and_calibrates_the_same(tmp_path, kind):
     bag = write_bag(tmp_path / "bag", run(20.0), compression="chunk")

@@ -74,6 +74,7 @@ def ros1(request, tmp_path, ros2) -> Path:
     return path
 
 
+@pytest.mark.spread(2)
 def test_messages_and_answer_are_those_of_the_same_data_in_ros2(ros1, ros2):
     assert raw(ros1) == raw(ros2)
     assert estimates(ros1) == estimates(ros2)

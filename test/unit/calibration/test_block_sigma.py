@@ -153,6 +153,7 @@ def test_noise_that_lasts_longer_than_the_longest_blocks_is_in_sigma(lasts, numb
     assert least < np.sqrt(np.mean(np.square(normalised))) < most
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(("count", "told"), [(12, 1.0), (24, 1.0), (24, 9.0)])
 def test_sigma_of_few_blocks_is_wrong_by_three_of_it_no_more_often_than_that_of_many(count, told):
     """Surveys 34211, 38246: pitch was off by 3.1 and 3.3 σ of 24 blocks."""

@@ -39,6 +39,7 @@ def sound() -> tuple[Calibrator, int]:
     return fed(run(SECONDS))
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("kind", "number", "stamp_ns"),
     [

@@ -377,6 +377,7 @@ def test_a_slow_dvl_that_is_off_now_and_then_costs_no_calibration():
     np.testing.assert_allclose(one_by_one.state, estimate.state, rtol=0, atol=1e-12)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(("from_s", "to_s"), [(56.0, 74.0), (40.0, 90.0)])
 def test_a_gap_of_the_dvl_ends_no_calibration(from_s, to_s):
     """The bottom was lost for 18 s about a block: replay and diagnosis ended in a traceback."""

@@ -49,6 +49,7 @@ def test_a_vertical_error_of_the_reference_does_not_turn_a_level_vehicles_pitch(
     assert abs(off) < min(2.0 * std, 0.5) and std < 0.7  # of 0.06 m/s it would be 2.5 degrees
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     "climb",
     [

@@ -62,6 +62,7 @@ def peak(run) -> int:
     return most
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("pause_s", [0.0, YEAR_S])
 def test_clocks_that_are_far_apart_are_found_across_a_pause(pause_s):
     found = far_clocks(motion(200.0, pause_s), np.eye(3))

@@ -143,6 +143,7 @@ def test_a_correction_that_makes_the_track_significantly_worse_is_rejected():
     assert too_short.after.per_km > 10.0 and not objections(too_short)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("memory_s", [40.0, 400.0])
 def test_slow_noise_of_the_reference_counts_as_noise_of_the_drift(memory_s):
     std, rng = 0.02, np.random.default_rng(8)

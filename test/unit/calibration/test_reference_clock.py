@@ -76,6 +76,7 @@ def test_a_reference_that_is_late_by_more_than_any_delay_of_the_dvl_is_named_as_
     assert offset_named(found(reference=30.0).suggestion, "reference_time_offset") == pytest.approx(30.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_how_samples_are_gathered_changes_nothing_about_clocks():
     samples = stamped_late(late(0.0), ReferenceSample, 0.6)
     assert calibrate(samples, NOISE, verified=True, block_size=400).suggestion == found(reference=0.6).suggestion

@@ -72,6 +72,7 @@ def registered(*args, **late) -> Registration:
     return found
 
 
+@pytest.mark.spread(4)
 @pytest.mark.parametrize(
     ("trajectory", "rate", "seconds"),
     [("box", 5.0, 0.0), ("figure8", 5.0, 0.8), ("free", 1.0, 0.8), ("free", 1.0, 30.0)],
@@ -88,6 +89,7 @@ def test_a_late_clock_is_found_and_no_other(trajectory, rate, seconds, stream):
     assert found.lever_arm[0] == pytest.approx(ARM, abs=5.0 * found.lever_arm_std[0] + 0.02)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("seconds", [(7.5, 7.0), (2.0, 5.0), (-1.0, 3.0)])
 def test_two_late_clocks_are_told_apart(seconds):
     dvl, reference = seconds
@@ -116,6 +118,7 @@ def test_a_reference_in_the_body_shows_only_the_difference_of_the_clocks():
     assert found.apart.delay_s == pytest.approx(2.0, abs=0.1) and not found.reference.is_shown
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.7), (np.pi, 0.0, -2.0), (0.3, 0.5, 1.0)])
 def test_a_mounting_that_nobody_told_is_found_with_the_clock(rpy):
     found = register(motion("free", 5.0, reference=5.0, mounting=rpy), None, np.zeros(3))
@@ -193,6 +196,7 @@ def test_a_stretch_of_bad_velocities_is_no_clock_that_pushes_it_out_of_the_overl
     assert abs(found.dvl.delay_s) < 3.0 and abs(found.reference.delay_s) < 3.0
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("seed", [0, 2])
 def test_nothing_is_taken_off_where_a_leg_does_not_show_its_clocks(seed):
     """A delay of 115 s was, which no parameter takes."""
@@ -285,6 +289,7 @@ MIRRORED = {
 }  # fmt: skip
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(("signs", "axis"), MIRRORED.items())
 def test_a_left_handed_driver_is_named_with_its_axis(signs, axis):
     """An arm of -0.52 m ± 0.08 for 0.60 and a yaw 4.3 degrees off were marginal, a pitch 2 degrees off accepted."""

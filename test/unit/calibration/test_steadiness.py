@@ -81,6 +81,7 @@ def test_a_drift_is_found_with_its_size(whose):
     assert found.lever_arm[0] == pytest.approx(ARM, abs=0.05)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("trajectory", "whose", "moves"),
     [("free", "imu", {"leap": 0.5}), ("box", "imu", {"drift": 1e-3}), ("free", "reference", {"leap": 0.3})],

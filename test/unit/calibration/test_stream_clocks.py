@@ -26,6 +26,7 @@ def test_of_many_numbers_every_so_many_th_is_kept(sizes):
     assert len(spread.kept) <= MOST and (every == 1 or len(spread.kept) >= MOST // 2)
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("seconds", [0, 18])
 @pytest.mark.parametrize("given", [feed, feed_columns])
 def test_live_clocks_that_are_apart_are_named_as_by_a_replay(seconds, given):

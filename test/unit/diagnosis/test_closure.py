@@ -50,6 +50,7 @@ def _noise(rng: np.random.Generator, memory_s: float) -> np.ndarray:
     return white + slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("memory_s", "times"), [(0.0, 1.0), (40.0, 3.0)])
 def test_nine_of_ten_true_closures_are_inside_the_interval(memory_s, times):
     """Slow noise was part of the gap, and parameters were exact: half of the intervals held it."""

@@ -317,6 +317,7 @@ def test_noise_keeps_the_colour_of_what_a_fit_has_taken_in(keep, low):
     assert not keep or np.median(plain) < 0.7
 
 
+@pytest.mark.slow
 def test_the_mean_of_slow_noise_is_inside_the_interval_of_what_its_memory_may_be():
     """Five memories long, a series says little of its memory: by the best one 75 % of means were inside."""
     rng, n, keep = np.random.default_rng(3), 300, float(np.exp(-1.0 / 60.0))

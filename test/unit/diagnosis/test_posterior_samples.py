@@ -47,6 +47,7 @@ def test_every_member_of_an_or_list_is_drawn_by_its_weight(arm):
     assert len(with_samples(twins, 50)["samples"]) == 50
 
 
+@pytest.mark.slow
 def test_a_draw_is_written_and_exported(tmp_path, capsys):
     effects = (injection("lever_arm:x_m=0.8,y_m=-0.3"),)
     scenario = Scenario(trajectory="free", seconds=200.0, gnss_std=0.02, gnss_rate=5.0, effects=effects)

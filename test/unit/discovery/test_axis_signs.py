@@ -39,6 +39,7 @@ def reasons_of(calibration):
     return calibration.replayed.result.verifications[calibration.model].reasons
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(("signs", "mounting"), [((1.0, -1.0, 1.0), ASTERN), ((1.0, -1.0, -1.0), (0.0, 0.0, 0.0))])
 def test_a_sway_that_a_current_contradicts_is_rejected_and_its_remedy_works(tmp_path, signs, mounting):
     wrong = recording(tmp_path / "wrong", signs, mounting=mounting)
@@ -87,6 +88,7 @@ def test_without_a_current_both_signs_are_asked_and_the_answer_is_marginal(tmp_p
     assert "DVL_SIGN_OPEN" not in codes(reasons_of(dc.replay(bag, history=False, **answer)))
 
 
+@pytest.mark.slow
 def test_a_mirrored_y_with_the_yaw_of_the_other_sign_is_asked(tmp_path):
     """It was asked for z only; the sign of y and the yaw are wrong at once."""
     said, signs = (0.0, 0.0, -np.pi / 4.0), (1.0, -1.0, 1.0)

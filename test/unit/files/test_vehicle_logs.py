@@ -25,6 +25,7 @@ from dvl_calib_ros.logs.trajectories import ImportOptions, import_files
 KNOT = 1852.0 / 3600.0
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("write", [telemetry, dataflash])
 def test_a_log_of_the_autopilot_is_dvl_gnss_and_attitude(write, tmp_path, capsys):
     pytest.importorskip("pymavlink", reason="needs the extra ardupilot")

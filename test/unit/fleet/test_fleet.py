@@ -162,6 +162,7 @@ def test_recordings_of_one_day_share_what_differs_from_day_to_day(tmp_path):
     assert np.degrees(day.std[2]) < np.hypot(0.1, alone) * 1.05
 
 
+@pytest.mark.slow
 def test_what_is_done_and_unchanged_is_not_done_again(dives, tmp_path, monkeypatch):
     place, out = tmp_path / "dives", tmp_path / "out"
     shutil.copytree(dives / "auv1", place / "auv1")

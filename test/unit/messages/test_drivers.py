@@ -95,6 +95,7 @@ def expected(bare, tmp_path_factory):
     return estimates(write_bag(tmp_path_factory.mktemp("expected") / "bag", bare))
 
 
+@pytest.mark.spread(3)
 @pytest.mark.parametrize("kind", TYPES)
 def test_the_same_data_gives_the_same_estimates_in_every_type(kind, bare, expected, tmp_path):
     bag = write_driver_bag(tmp_path / "bag", bare, kind)
@@ -102,6 +103,7 @@ def test_the_same_data_gives_the_same_estimates_in_every_type(kind, bare, expect
     assert replayed(bag).dvl_type == kind
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("kind", "version"), [(ODOMETRY, "first"), (MARINE, "first"), (A50, "covariance"), (A50, "fixed sizes")]
 )
@@ -111,6 +113,7 @@ def test_a_covariance_counts_the_same_in_every_type_that_has_one(kind, version, 
     assert estimates(bag) == estimates(write_bag(tmp_path / "standard", samples))
 
 
+@pytest.mark.spread(3)
 @pytest.mark.parametrize("kind", [TWIST_STAMPED, ODOMETRY])
 @pytest.mark.parametrize("frame", VelocityFrame)
 def test_a_reference_may_come_as_twist_or_odometry_in_any_frame(kind, frame, tmp_path):

@@ -83,6 +83,7 @@ def write_team_bag(path: Path, kind: str, change: Callable[[int, Any], None] = l
     return path
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("kind", TYPES)
 def test_the_answer_is_that_of_a_listed_type(tmp_path, kind):
     bag = write_team_bag(tmp_path / "bag", kind)
@@ -131,6 +132,7 @@ def test_a_map_that_does_not_fit_is_named_with_the_fields_there_are(tmp_path, ca
     assert all(expected in said for expected in WRONG[text])
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("kind", "expected"),
     [

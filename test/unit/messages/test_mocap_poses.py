@@ -46,6 +46,7 @@ def write_tank(path: Path, kind: str, topic: str, frame_id: str = "mocap") -> Pa
     return path
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(("kind", "topic"), [(POSE_TYPES[0], "/mocap/rov/pose"), (POSE_TYPES[1], "/vrpn/rov/pose")])
 def test_the_mounting_is_found_with_the_noise_that_the_data_show(tmp_path, kind, topic):
     found = dvl_calib_ros.replay(write_tank(tmp_path / "bag", kind, topic))

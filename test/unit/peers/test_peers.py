@@ -30,6 +30,7 @@ from validation.trial.run import Trial, read_answers
 from validation.trial.truth import Category, unseal
 from validation.trial.vehicle import FAULTS
 
+pytestmark = pytest.mark.slow
 SEED = 9100
 
 
@@ -82,7 +83,6 @@ def fitted(recorded, name):
 ALWAYS_THERE = [name for name in (*LINEAR, *CLOCKS) if name != "water_lock"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ALWAYS_THERE[::3])
 def test_the_forward_model_means_by_an_effect_what_the_generator_means(name, tmp_path):
     """Written apart, the two agree on sign, size and frame of every effect."""

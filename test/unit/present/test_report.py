@@ -178,6 +178,7 @@ def test_the_page_loads_nothing_and_runs_only_its_own_two_scripts(made, evaluate
         assert "default-src 'none'" in policy and allowed == [["script-src", *(f"'sha256-{each}'" for each in hashes)]]
 
 
+@pytest.mark.slow
 def test_nothing_in_a_bag_becomes_markup(tmp_path):
     """Pictures and all."""
     folder = tmp_path / "<script>alert(1)<"

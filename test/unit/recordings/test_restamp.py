@@ -27,6 +27,7 @@ def write(path: Path, kind: str, ahead_s: int) -> Path:
     return write_driver_bag(path, run(SECONDS), kind, changes=dict.fromkeys(range(1000), shift))
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("kind", "ahead_s", "restamp"),  # read in columns, or one by one
     [

@@ -38,6 +38,7 @@ def at_factor(path: Path, factor: float) -> Path:
     return path
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("factor", [0.3, 4.0])
 def test_rates_and_what_is_found_are_those_of_the_stamps(tmp_path, factor):
     examined = examine([at_factor(tmp_path / "bag", factor)], Parameters())
