@@ -247,6 +247,7 @@ def test_a_mounting_that_nobody_told_is_no_roll_that_motion_does_not_show(tmp_pa
     np.testing.assert_allclose(np.degrees(np.abs(found)), (0.0, 0.0, yaw_deg), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_mounting_that_was_found_and_is_off_is_found_better_and_not_called_misaligned(tmp_path):
     """Drawn mountings are guessed: 45 for one of 37, which was rejected as off by 6.6 degrees."""
     told = Told()
@@ -262,6 +263,7 @@ def test_a_mounting_that_was_found_and_is_off_is_found_better_and_not_called_mis
     assert f"mounting 0° 0° {nominal:g}°" in " ".join(run.discovery.doubts)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("has_reference", [False, True])
 def test_the_answer_says_against_what_its_angles_are(tmp_path, capsys, has_reference):
     """What nobody can tell is said: a constant crab without a reference, the IMU's own errors with one."""

@@ -103,6 +103,7 @@ def test_a_user_finds_tables_by_short_names_with_units(calibration):
     assert list(tables["held_out"].columns[1:4]) == ["uncorrected_mps", "corrected_mps", "predicted_mps"]
 
 
+@pytest.mark.slow
 def test_a_printed_mounting_has_no_powers_of_ten(bag):
     """A quaternion of /tf_static gives a pitch of 6e-33 rad, in which pandas printed every number of the column."""
     pytest.importorskip("pandas")
@@ -168,6 +169,7 @@ def test_the_other_functions_give_dataclasses(tmp_path, bag):
             nothing()
 
 
+@pytest.mark.slow
 def test_bags_are_compared_as_result_files_are(calibration, later, tmp_path):
     saved = calibration.save(tmp_path / "before.yaml")
     found = dc.compare(saved, later)

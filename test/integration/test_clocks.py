@@ -34,7 +34,7 @@ def with_stamps_ahead(path, topic, seconds):
         ("imu/data", 6, "the IMU's stamps are [56].* s ahead"),
     ],
 )
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 def test_clocks_that_differ_by_more_than_any_delay_are_named_and_nothing_is_accepted(tmp_path, topic, seconds, said):
     bag = with_stamps_ahead(tmp_path / "bag", topic, seconds)
     calibration = dc.replay(bag, history=False)

@@ -82,6 +82,7 @@ def test_a_dvl_that_is_displaced_or_late_is_not_taken_for_one_that_is_turned(tmp
     np.testing.assert_allclose(mounting.rpy_deg[1:], 0.0, atol=0.5)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("ahead_m", [-0.3, 1.9])
 def test_on_a_circle_a_displaced_dvl_is_not_taken_for_a_turned_one_and_its_yaw_is_not_claimed(tmp_path, ahead_m):
     calibration = dc.replay(recorded(tmp_path / "bag", (ahead_m, 0.0, 0.0), 0.0, motion=circle), history=False)

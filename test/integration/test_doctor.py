@@ -241,6 +241,7 @@ def test_another_clock_is_the_first_reason_and_the_next_command_has_its_remedy(t
     assert "--restamp log --save" in command
 
 
+@pytest.mark.slow
 def test_a_dvl_that_pings_unevenly_is_not_said_to_be_stamped_at_reception(tmp_path):
     """Ten of ten clean recordings of a survey vehicle were warned of it."""
     examined = examine([faulty(tmp_path / "bag", dvl_only(uneven_pings))], Parameters())

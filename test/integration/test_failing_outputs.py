@@ -40,7 +40,7 @@ def shell(redirected: str, *arguments, before: str = "", module: str = "cli.main
 CLOSED = ["<&- ", ">&- ", "<&- >&- 2>&- "]
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("closed", CLOSED)
 def test_closed_streams_are_as_good_as_nowhere(bag, tmp_path, closed):
     done = shell(closed, "replay", bag, "--json", tmp_path / "out.json", "--verbose")
@@ -167,6 +167,7 @@ def test_what_a_full_disk_does_not_take_is_printed_and_the_other_files_are_writt
     assert large.read_text() == "the one before" and len(os.listdir(tmp_path)) == 3
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_said_in_one_line_also_when_nobody_reads_the_answer(bag, tmp_path):
     done = shell("> >(true)", "replay", bag, "--json", tmp_path / "o.json", before="ulimit -f 1; trap '' XFSZ;")
     assert done.returncode == 2 and done.stderr.splitlines()[-1].endswith("name a file on another disk")

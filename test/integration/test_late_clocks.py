@@ -72,6 +72,7 @@ def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
     assert replayed.result.estimate.state[5] == pytest.approx(ARM, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_reference_in_the_body_is_calibrated_with_and_the_other_reading_is_said(tmp_path):
     bag = bag_of(tmp_path, {"reference_time_offset": 5.0}, gnss_frame=VelocityFrame.BODY)
     found = discover([bag], Parameters())
@@ -79,6 +80,7 @@ def test_a_reference_in_the_body_is_calibrated_with_and_the_other_reading_is_sai
     assert any("or the DVL's as much early" in each for each in found.found)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("trajectory", ["free", "straight"])
 def test_clocks_in_time_or_not_shown_are_left_alone(trajectory, tmp_path):
     found = discover([bag_of(tmp_path, {}, trajectory)], Parameters())

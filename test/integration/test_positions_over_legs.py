@@ -171,6 +171,7 @@ def test_a_boats_positions_alone_tell_what_its_velocities_tell(tmp_path):
     assert abs(scale) < 2.0 * math.hypot(by_position.recording_std[3], by_velocity.recording_std[3])
 
 
+@pytest.mark.slow
 def test_doctor_says_of_noisy_positions_what_a_replay_gives(usbl):
     """Velocities made of them are not what is used: neither their unit nor their covariance is held against it."""
     seen = examine([usbl], Parameters())

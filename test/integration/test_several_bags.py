@@ -43,6 +43,7 @@ def place(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_recordings_of_one_mounting_are_averaged_and_the_night_is_no_dropout(place):
     bags = [place / "monday", place / "tuesday"]
     plain, checked = replay(bags, Parameters()), checked_replay(bags, Parameters())

@@ -76,6 +76,7 @@ def applied(capsys, saved: Path, *options: str) -> str:
     return " ".join(said.split())
 
 
+@pytest.mark.slow
 def test_apply_takes_the_speed_of_sound_that_the_recording_says_was_used(saved, capsys):
     said = applied(capsys, saved, "waterlinked", "--now", "mounting_rotation_offset=0")
     new = re.search(rf"speed_of_sound: {int(USED)}[.\d]* \(as recorded\) -> ([\d.]+) m/s", said)

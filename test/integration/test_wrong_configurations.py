@@ -155,7 +155,7 @@ def test_an_effect_beyond_the_model_is_noise_and_no_calibration_is_better_for_it
     assert verification.held_out.predicted > 0.2
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_refuses_it(wrong, tmp_path, capsys):
     samples, given, code = WRONG[wrong]

@@ -114,6 +114,7 @@ class Broadcaster:
 SENT: dict[str, list] = {}
 
 
+@pytest.mark.slow
 def test_with_publish_tf_the_transform_is_that_pose_and_another_of_the_same_frame_is_warned_of(world, monkeypatch):
     stub = ModuleType("tf2_ros")
     stub.StaticTransformBroadcaster = Broadcaster

@@ -103,6 +103,7 @@ def test_the_node_and_the_replay_of_one_bag_agree_in_every_model(scenario, world
         assert len(offline.segments) == 4
 
 
+@pytest.mark.slow
 def test_the_papers_own_selection_is_published_whatever_is_selected(world, bag):
     with world.calibration_node("model:=unaided", *as_arguments(PATIENT)):
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
@@ -437,6 +438,7 @@ def test_best_effort_and_reliable_publishers_are_both_heard(world):
         until(lambda: heard(first.send), "a sample of the reliable publisher, still")
 
 
+@pytest.mark.slow
 def test_wrong_frames_and_a_silent_dvl_are_named_in_the_diagnostics(world):
     with node_here(world) as node:
         diagnostics = world.received(DiagnosticArray, "/diagnostics")

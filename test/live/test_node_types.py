@@ -89,6 +89,7 @@ def test_the_node_takes_noisy_positions_over_legs_as_the_replay_does(world, tmp_
     assert live["verification"]["held_out"] is not None
 
 
+@pytest.mark.slow
 def test_a_publisher_of_another_type_is_named_with_the_parameter_to_set(world):
     with world.calibration_node():  # in one process, DDS would refuse the second type
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
@@ -147,6 +148,7 @@ def test_a_dvl_that_sends_nothing_but_refused_messages_is_silent_and_what_is_wro
     assert {item.key: item.value for item in status.values}["dvl flagged_invalid"] == "8"
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("turned", [False, True])
 def test_what_is_usable_follows_the_verdict(turned):
     """Of two DVLs on one topic, of which one is turned by 180°, no angle is known; of two that agree one is."""
@@ -173,6 +175,7 @@ def test_what_is_usable_follows_the_verdict(turned):
     assert said == (["no"] * 4 if turned else ["no", "yes", "yes", "yes"])
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("model", "rate", "goes_on"),
     [

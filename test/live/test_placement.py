@@ -67,6 +67,7 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
         assert result["counts"]["dvl"]["accepted"] > 250
 
 
+@pytest.mark.slow
 @pytest.mark.spread(1)
 @pytest.mark.parametrize("given", [(), ("heading_deviation_std:=0.01",)])
 def test_what_the_imu_claims_of_its_heading_is_taken_unless_given(world, tmp_path, given):

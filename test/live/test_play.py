@@ -129,6 +129,7 @@ def mounted(tmp_path_factory):
     return told.write(tmp_path_factory.mktemp("mounted") / "bag")
 
 
+@pytest.mark.slow
 def test_the_node_takes_the_mounting_of_a_played_tf_static_as_replay_does(world, mounted, capsys, monkeypatch):
     """Also where tf2_msgs is not installed, which pip does not have."""
     monkeypatch.setitem(sys.modules, "tf2_msgs", None)

@@ -150,6 +150,7 @@ def is_number(text: str) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_every_curve_of_plotjuggler_is_a_series_of_numbers_that_the_node_publishes(published):
     curves = [curve.get("name") for curve in ElementTree.parse(PLOTJUGGLER).iter("curve")]
     assert len(curves) > 10

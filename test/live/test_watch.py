@@ -427,6 +427,7 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
     assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is back
 
 
+@pytest.mark.slow
 def test_q_does_not_replace_a_good_result_by_a_few_samples_without_asking(world, tmp_path):
     from geometry_msgs.msg import TwistWithCovarianceStamped
     from ros import until

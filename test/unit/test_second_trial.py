@@ -22,6 +22,7 @@ from validation.second_recordings import (
 )
 from validation.second_trial import KINDS, TABLE, TIMES, draw, is_right, sizes_of, true_closure, visibility
 
+pytestmark = pytest.mark.slow
 LATE_S = 0.3
 
 

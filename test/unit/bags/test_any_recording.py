@@ -218,6 +218,7 @@ def test_salvage_of_a_type_in_two_definitions_gives_messages_that_can_be_decoded
         assert reader.duration == max(t for _, t, _ in raw(tmp_path / "new")) - 10**18 + 1
 
 
+@pytest.mark.slow
 def test_a_driver_that_was_upgraded_between_two_bags_is_read_by_the_definitions_of_each(tmp_path):
     samples = [sample for sample in run(20.0) if isinstance(sample, DvlSample)]
     old = write_driver_bag(tmp_path / "old", samples[:50], A50, maker=Maker("first"))
@@ -296,6 +297,7 @@ def big_endian(topic: str, data: bytes) -> bytes:
     return bytes(JAZZY.serialize_cdr(JAZZY.deserialize_cdr(data, kind), kind, little_endian=False))
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     "change",
     [big_endian, lambda _, data: data + bytes(4)],

@@ -122,6 +122,7 @@ def test_mcap_files_of_other_writers_give_the_same_messages(tmp_path, plain, com
     assert messages == raw(plain) and not notes
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(("at_once", "in_memory"), [(0, batches.IN_MEMORY), (0, 20_000), (1 << 30, 20_000)])
 def test_chunks_of_one_topic_each_are_merged_in_memory_or_on_disk(tmp_path, plain, monkeypatch, at_once, in_memory):
     monkeypatch.setattr(sources, "MERGED_AT_ONCE", at_once)
@@ -181,6 +182,7 @@ def test_a_dvl_that_publishes_in_the_body_frame_is_refused_with_the_remedy(tmp_p
         replayed(bag)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("frame", [VelocityFrame.BODY, VelocityFrame.ENU])
 def test_prior_source_reference_takes_sway_and_heave_from_the_reference(tmp_path, frame):
     bag = write_bag(tmp_path / "bag", run(frame=frame))

@@ -64,7 +64,7 @@ def causes(found):
     return [*held, *(cause for each in held for cause in each.causes)]
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("wrong", "code", "numbers"),
     [

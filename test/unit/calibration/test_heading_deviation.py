@@ -45,11 +45,13 @@ def deviation(*args, **more):
     return heading_deviation(yaw, calibrator.heading_deviation)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.012, -0.009)])
 def test_a_constant_error_of_the_heading_or_of_the_reference_is_no_deviation(offset):
     assert deviation(0, lambda *_: 0.02, offset) is None
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("cycles", [1, 2])
 def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
     size = math.radians(2.0)

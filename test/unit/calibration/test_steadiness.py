@@ -59,7 +59,7 @@ def test_noise_that_lasts_as_long_as_blocks_of_a_stretch_is_no_drift():
     assert found(3.5) is None
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("seconds", [0.3, -3.0])
 @pytest.mark.parametrize("whose", ["dvl", "reference"])
 def test_one_leap_is_found_with_its_size_and_time(whose, seconds):
@@ -92,6 +92,7 @@ def test_what_looks_like_an_arm_of_its_own_in_each_stretch_is_told_by_the_arm_be
     assert found.lever_arm[0] == pytest.approx(ARM, abs=0.06)
 
 
+@pytest.mark.slow
 def test_only_the_clock_of_the_dvl_is_put_right_and_what_is_left_is_said():
     of_dvl, of_reference = (registered("figure8", whose, leap=1.0) for whose in ("dvl", "reference"))
     assert of_dvl.unsteady is not None and of_reference.unsteady is not None

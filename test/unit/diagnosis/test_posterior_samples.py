@@ -22,6 +22,7 @@ def arm():
     return diagnosed(effects=[LEVER], seconds=300.0, gnss_std=0.02)
 
 
+@pytest.mark.slow
 def test_draws_scatter_as_the_intervals_say(arm):
     samples = with_samples(arm, 400)["samples"]
     drawn = [{each["name"]: each["parameters"] for each in sample["effects"]} for sample in samples]

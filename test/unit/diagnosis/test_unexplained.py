@@ -158,6 +158,7 @@ def test_what_is_off_in_turns_is_unknown_and_no_heading_error():
     assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and not diagnosis.effects
 
 
+@pytest.mark.slow
 def test_effects_that_an_unknown_cause_may_be_a_part_of_are_not_named_beside_it():
     """A step in a bias was named a current and two drifts beside what is unknown, by another reference other ones."""
     run = simulate(scenario("free", seconds=300.0, gnss_std=0.03, effects=[LEVER]))

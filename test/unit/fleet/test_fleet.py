@@ -224,6 +224,7 @@ def test_a_recording_whose_name_is_no_text_or_that_is_gone_costs_its_row(dives, 
     assert dc.fleet(place, tmp_path / "out", jobs=1).unchanged == 2
 
 
+@pytest.mark.slow
 def test_what_recordings_say_of_the_water_is_in_rows_and_on_the_page(tmp_path):
     bag = with_water(tmp_path / "dives" / "auv1" / "dive")
     result = dc.fleet(tmp_path / "dives", tmp_path / "out", jobs=1)
@@ -418,6 +419,7 @@ def is_over(pid: int) -> bool:
         return True
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_parent_that_is_killed():
     """Those that work, and one that waits for work in vain."""
     script = (

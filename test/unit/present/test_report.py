@@ -153,6 +153,7 @@ def test_models_can_be_told_apart_and_look_the_same_everywhere():
     assert len(set(MODEL_STYLES.values())) == len(MODELS)
 
 
+@pytest.mark.slow
 def test_the_same_data_gives_the_same_figures(tmp_path):
     pages = []
     for path in (tmp_path / "once.html", tmp_path / "again.html"):

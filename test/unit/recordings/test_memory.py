@@ -183,6 +183,7 @@ def test_two_hours_beside_40_gb_of_images_are_examined_in_400_mb(tmp_path):
     assert peak < 400
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks Linux for the peak")
 def test_images_beside_cost_no_memory(tmp_path):
     peaks = [measured(long_recording(tmp_path / f"{n}.mcap", 100, n), "open")[0] for n in (0, 10)]
