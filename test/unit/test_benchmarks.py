@@ -71,27 +71,6 @@ def test_a_ratio_that_is_no_number_fails_against_any_baseline(tmp_path):
     assert main(["--against", str(baseline)], {"fine": lambda _: [measured(float("nan"))]}) == 1
 
 
-def test_what_the_baseline_lacks_and_what_it_has_more_is_said(tmp_path, capsys):
-    baseline = tmp_path / "baseline.json"
-    save_baseline(baseline, 1.0)
-    parts = {"fine": lambda _: [measured(1.0, "memory")], "other": lambda _: [measured(1.0)]}
-    assert main(["--against", str(baseline)], parts) == 0
-    said = capsys.readouterr().err.splitlines()
-    assert "other: not in the baseline" in said
-    assert "fine: memory: not in the baseline" in said
-    assert "fine: speed: in the baseline, but not measured" in said
-
-
-@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"commit": "", "parts": {"batch": {}}}'])
-def test_a_baseline_that_is_none_is_one_line(tmp_path, capsys, content):
-    baseline = tmp_path / "baseline.json"
-    if content is not None:
-        baseline.write_text(content)
-    assert main(["--against", str(baseline)], {"fine": lambda _: [measured(1.0)]}) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert str(baseline) in line and "--json" in line
-
-
 @pytest.mark.parametrize("difference", [1e-8, float("nan"), float("inf")])
 def test_two_sides_with_different_states_are_no_comparison(difference):
     with pytest.raises(DifferentWorkError, match="differ by"):

@@ -179,15 +179,6 @@ def test_without_its_data_a_measurement_is_skipped_with_the_reason_and_its_figur
     assert "0 figures checked, 3 skipped" in out
 
 
-def test_what_cannot_be_asked_or_written_is_one_line(place, monkeypatch, capsys):
-    measures(monkeypatch, lambda _: {"fast": 2.345})
-    assert main(["figures", "nonsense"]) == 2
-    assert main(["figures"]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert "'nonsense' is no measurement; there are speeds" in lines[0]
-    assert "'slow' is not in validation/figures" in lines[1] and len(lines) == 2
-
-
 def test_a_picture_that_does_not_say_of_which_commit_it_is_fails_the_check(place, capsys):
     (place / "README.md").write_text("No figures.\n")
     (place / "docs" / "page.md").unlink()

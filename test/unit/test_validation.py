@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT
 
 import dvl_calib_ros as dc
-from validation import combinations, mutants, repeat, surveys
+from validation import combinations, mutants, surveys
 from validation.__main__ import COMMANDS, MODULES, main
 from validation.combinations.recordings import physics_path, write_combination
 from validation.drawn import share
@@ -30,22 +30,6 @@ def test_a_wrong_call_is_refused_in_one_line(capsys, wrong):
     assert main(wrong) == 2
     said = capsys.readouterr()
     assert said.out == "" and said.err.startswith("python -m validation: ") and said.err.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_a_run_that_fails_is_counted_and_its_log_kept(tmp_path, monkeypatch, capsys):
-    suite = tmp_path / "test_two.py"
-    suite.write_text("def test_good(): pass\ndef test_bad(): assert 'here' == 'there'\n")
-    monkeypatch.setattr(repeat, "SUITE", ("-q", "-c", str(tmp_path / "none.ini"), str(suite)))
-    (tmp_path / "none.ini").write_text("[pytest]\n")
-    assert repeat.main(["--times", "1", "--logs", str(tmp_path / "logs")]) == 1
-    said = capsys.readouterr().out
-    assert "   1  passed 1  failed 1  " in said and said.endswith("1 of 1 runs failed\n")
-    (log,) = (tmp_path / "logs").iterdir()
-    assert "assert 'here' == 'there'" in log.read_text()
-    suite.write_text("def test_good(): pass\n")
-    assert repeat.main(["--times", "1"]) == 0
-    assert "0 of 1 runs failed" in capsys.readouterr().out
 
 
 def test_every_mutant_changes_one_place_that_is_there_and_its_tests_are():

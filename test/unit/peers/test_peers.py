@@ -15,9 +15,7 @@ from conftest import ROOT
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.errors import InputError
-from validation.__main__ import main
-from validation.peers import needed as libraries
-from validation.peers.asked import PEERS, ask, peers
+from validation.peers.asked import PEERS, ask
 from validation.peers.command import asked_anew
 from validation.peers.foreign import foreign_cases, has_physics, record_foreign
 from validation.peers.forward import CLOCKS, LINEAR, Clock, Forward
@@ -105,18 +103,6 @@ def test_peers_share_no_code_with_the_diagnosis():
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert shown.stdout.strip() == "[]"
-
-
-def test_a_library_that_is_missing_is_told_in_one_line(monkeypatch, capsys, tmp_path):
-    def missing(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr(libraries.importlib, "import_module", missing)
-    with pytest.raises(InputError, match=r"dynesty is not installed; pip install -r validation/peers"):
-        peers(["evidence"])
-    monkeypatch.undo()
-    assert main(["peers", "--cases", "0"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 # ------------------------------------------------------------------ side by side

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ROOT
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from yaml_text import parsed
@@ -17,7 +14,7 @@ from validation.trial import generator, recorded
 from validation.trial.cases import draw
 from validation.trial.generator import VERTICALS, Noise
 from validation.trial.half_real import HORIZONTAL, MIN_DISTANCE, MIN_Q
-from validation.trial.plan import Case, Family, plan
+from validation.trial.plan import Case, Family
 from validation.trial.recorded import recordings_folder
 from validation.trial.strength import Yardstick
 from validation.trial.truth import Category
@@ -162,18 +159,6 @@ def test_rates_differenced_as_imported_are_those_of_half_a_sample_later(no_imu_n
     _, _, (time, attitude, rates) = samples_of(drawn)
     turned = Rotation.concatenate([attitude[k] * Rotation.from_rotvec(rates[k]) for k in range(len(time) - 1)])
     assert np.abs((turned.inv() * attitude[1:]).magnitude()).max() < 1e-9
-
-
-def test_without_the_recordings_their_cases_are_left_out_and_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("DVL_CALIB_SHARED", str(tmp_path))
-    assert recordings_folder() is None
-    assert {each.family for each in plan(kinds=("box",))} == {Family.SIMULATED}
-    done = subprocess.run(
-        [sys.executable, "-m", "validation", "trial", "--family", "half_real",
-         "--out", str(tmp_path / "trial")],
-        capture_output=True, text=True, check=False, cwd=ROOT,
-    )  # fmt: skip
-    assert done.returncode == 0 and recorded.NO_RECORDINGS.split(";")[0] in done.stderr
 
 
 def test_a_displaced_dvl_has_what_its_name_says_beside_a_long_arm_and_a_horizontal_reference():

@@ -5,9 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
-
-from dvl_calib_ros.errors import InputError
 from validation.trial import sequential as sequential_trial
 from validation.trial.figures import KNOWN
 from validation.trial.plan import plan
@@ -95,9 +92,3 @@ def test_the_first_cases_are_of_every_open_question(tmp_path):
     assert {case.category for case in first} >= {Category.UNKNOWN, Category.SINGLE}
     same = sequential.queues["same with and without the vertical"]
     assert [case.twin for case in same[::2]] == same[1::2]
-
-
-def test_answers_of_another_commit_are_not_added_to(tmp_path):
-    run(tmp_path, right, seconds=0.0)
-    with pytest.raises(InputError, match=r"of commit abc, not def; give another --out"):
-        run(tmp_path, right, "def", seconds=0.0)

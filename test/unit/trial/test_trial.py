@@ -20,7 +20,7 @@ from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.logs.trajectories import read_columns
-from validation.trial import generator, main
+from validation.trial import generator
 from validation.trial.cases import draw
 from validation.trial.generator import Noise, record
 from validation.trial.motion import MARGIN_S, TUNING_KINDS, manoeuvre
@@ -330,14 +330,6 @@ def test_a_trial_that_was_killed_goes_on_and_ends_as_if_it_had_not_been(tmp_path
     assert documents(read_answers(answers)) == documents(whole)
 
 
-def test_the_number_of_workers_changes_nothing(tmp_path):
-    cases = short_cases(3)
-    one = Trial(tmp_path / "one", jobs=1, answerer=count_messages)
-    two = Trial(tmp_path / "two", jobs=2, answerer=count_messages)
-    assert documents(one.run(cases)) == documents(two.run(cases))
-    assert unseal(one.sealed) == unseal(two.sealed)
-
-
 def test_the_diagnosis_gets_bags_and_no_truth(tmp_path):
     seen = []
 
@@ -394,28 +386,3 @@ def test_what_was_said_is_computed_again_by_the_generator(tmp_path):
     assert left["truth"] < 1e-9
     assert left["nothing"] == pytest.approx(true.before_mps) and true.before_mps > 1e-3
     assert left["nonsense"] == pytest.approx(true.before_mps)
-
-
-def test_a_folder_with_another_trial_is_refused(tmp_path):
-    Trial(tmp_path, seed=1, jobs=1, answerer=count_messages).run([])
-    with pytest.raises(InputError, match=r"trial.json: holds a trial of .*give another folder or the same seed"):
-        Trial(tmp_path, seed=2, jobs=1, answerer=count_messages).run([])
-    (tmp_path / "answers.jsonl").write_text("no json\n")
-    with pytest.raises(InputError, match="not the answers of a trial"):
-        Trial(tmp_path, seed=1, jobs=1, answerer=count_messages).run([])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--cases", "0"], "--cases: 0 is no number of cases"),
-        (["--jobs", "-1"], "--jobs: -1 is negative"),
-        (["--seed", "-1"], "--seed: -1 is negative"),
-        (["--minutes", "-1"], "--minutes: -1.0 is no time"),
-        (["--case", "half_real/nothing"], "--case half_real/nothing: no such case; give a key or an id"),
-    ],
-)
-def test_bad_options_are_told_before_anything_is_done(options, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        main(["--out", str(tmp_path / "trial"), *options])
-    assert not (tmp_path / "trial").exists()
