@@ -110,6 +110,7 @@ def pytest_collection_finish() -> None:
     gc.get_freeze_count = lambda: frozen
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
     """What a file has imported stays, too."""
     if nextitem is not None and nextitem.path != item.path:
