@@ -9,17 +9,21 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from log_fixtures import general_nmea, pd0, sentence
 from scipy.spatial.transform import Rotation
 from stacks import FIX, GNSS_STD, IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, true_mounting
 
 import dvl_calib_ros
+from dvl_calib_ros.api import arguments
 from dvl_calib_ros.calibration.numerics.frames import Array
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.examination import examine
 from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 
 DVL, REFERENCE = "/dvl/velocity", "/gnss/velocity"
@@ -289,6 +293,33 @@ def told_by(tell: Callable[[Told, bool], None], of: Callable[[], Motion] = motio
 def contradicts(doctor: str, replay: str) -> bool:
     """Return whether doctor says yes where replay rejects, or no where replay is usable."""
     return doctor == ("yes" if replay == "reject" else "no")
+
+
+def once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that computes once what all three commands ask with the same parameters."""
+    kept: dict[str, Any] = {}
+
+    @wraps(function)
+    def kept_or_new(recording: Any, *given: Any, **named: Any) -> Any:
+        key = repr((given, named))
+        if key not in kept:
+            try:
+                kept[key] = function(recording, *given, **named)
+            except InputError as error:
+                kept[key] = error
+        if isinstance(kept[key], InputError):
+            raise kept[key]
+        return kept[key]
+
+    return kept_or_new
+
+
+def ask_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on, of one recording, compute once what its commands ask with the same parameters."""
+    for name in ("discover", "checked_replay"):
+        original = getattr(examine, name)
+        monkeypatch.setattr(examine, name, once(getattr(original, "__wrapped__", original)))
+    monkeypatch.setattr(arguments, "discover", examine.discover)
 
 
 NOISY = "accept", "marginal"  # speed over ground is noisy, and without a reference nothing is verified

@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from situations import contradicts
+from situations import ask_once, contradicts
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.api import arguments
 from dvl_calib_ros.diagnosis import diagnose
 from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.examination import examine
 from dvl_calib_ros.verdict.reasons import is_cause
 from validation.stacks import shared_folder
 
@@ -60,30 +58,9 @@ pytestmark = [
 ]
 
 
-def once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that computes once what all three commands ask with the same parameters."""
-    kept: dict[str, Any] = {}
-
-    def kept_or_new(recording: Any, *given: Any, **named: Any) -> Any:
-        key = repr((given, named))
-        if key not in kept:
-            try:
-                kept[key] = function(recording, *given, **named)
-            except InputError as error:
-                kept[key] = error
-        if isinstance(kept[key], InputError):
-            raise kept[key]
-        return kept[key]
-
-    return kept_or_new
-
-
 def assert_one_answer(bag: Path, monkeypatch: pytest.MonkeyPatch, **parameters: Any) -> str:
     """Ask all three, and return the code of the first cause of a rejection. A refusal is a no."""
-    found = once(examine.discover)
-    monkeypatch.setattr(examine, "discover", found)
-    monkeypatch.setattr(arguments, "discover", found)
-    monkeypatch.setattr(examine, "checked_replay", once(examine.checked_replay))
+    ask_once(monkeypatch)
     monkeypatch.setattr(diagnose, "diagnose", lambda *_: NAMED)
     try:
         examined = dc.doctor(bag, **parameters)

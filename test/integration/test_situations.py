@@ -9,7 +9,7 @@ import pytest
 import stacks
 from remedies import changes
 from scipy.spatial.transform import Rotation
-from situations import DVL, SITUATIONS, contradicts, long_motion, sound
+from situations import DVL, SITUATIONS, ask_once, contradicts, long_motion, sound
 from stacks import ODOMETRY, TWIST, Told, true_mounting
 
 import dvl_calib_ros as dc
@@ -30,9 +30,10 @@ SLOW = set(SITUATIONS).difference(UNDER_2_S)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in SITUATIONS])
-def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_that_works(name, tmp_path):
+def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_that_works(name, tmp_path, monkeypatch):
     situation = SITUATIONS[name]
     bag = situation.write(tmp_path / "bag", True)
+    ask_once(monkeypatch)
     calibration = dc.replay(bag, history=False)
     assert not contradicts(dc.doctor(bag).verdict, calibration.verdict)
     if situation.cause:
@@ -46,6 +47,7 @@ def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_t
             typed = changes(said, Parameters.from_mapping(calibration.replayed.result.parameters))
         else:
             bag = situation.write(tmp_path / "mended", False)
+        ask_once(monkeypatch)  # anew: of another recording
         calibration = dc.replay(bag, history=False, **typed)
     assert calibration.verdict in situation.verdicts, calibration.reasons
     errors_deg, std_deg = errors_of(calibration, situation.yaw_deg)
