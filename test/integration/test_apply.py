@@ -121,7 +121,7 @@ def difference(a: Rotation, b: Rotation) -> float:
 # ---------------------------------------------------------------- URDF
 
 
-def test_the_urdf_has_the_corrected_mounting_and_every_other_byte_as_before(tmp_path, saved):
+def test_the_urdf_has_the_corrected_mounting_and_every_other_byte_as_before_also_applied_twice(tmp_path, saved, capsys):
     urdf = robot(tmp_path / "robot.urdf")
     before = urdf.read_bytes()
     assert difference(mounted(urdf), corrected(saved)) > math.radians(1.0)
@@ -131,7 +131,9 @@ def test_the_urdf_has_the_corrected_mounting_and_every_other_byte_as_before(tmp_
     (first, last), (_, new_last) = spans
     assert before[:first] == urdf.read_bytes()[:first]
     assert before[last:] == urdf.read_bytes()[new_last:]
-    assert (tmp_path / "robot.urdf.bak").read_bytes() == before
+    after = urdf.read_bytes()
+    assert apply(saved, "--urdf", urdf) == 0 and "already up to date" in capsys.readouterr().out
+    assert (urdf.read_bytes(), (tmp_path / "robot.urdf.bak").read_bytes()) == (after, before)
 
 
 @pytest.mark.parametrize(
@@ -222,16 +224,6 @@ def test_of_a_driver_that_points_down_the_urdf_keeps_its_axes_and_the_transform_
     assert difference(Rotation.from_quat(quaternion), corrected(saved) * flip) < 1e-8
 
 
-def test_applied_twice_is_applied_once_and_the_file_before_is_still_kept(tmp_path, saved, capsys):
-    urdf = robot(tmp_path / "robot.urdf")
-    before = urdf.read_bytes()
-    assert apply(saved, "--urdf", urdf) == 0
-    after = urdf.read_bytes()
-    assert apply(saved, "--urdf", urdf) == 0
-    assert "already up to date" in capsys.readouterr().out
-    assert (urdf.read_bytes(), (tmp_path / "robot.urdf.bak").read_bytes()) == (after, before)
-
-
 def test_a_urdf_of_another_mounting_is_refused_unless_forced(tmp_path, saved, capsys):
     urdf = robot(tmp_path / "robot.urdf", mounting=(0.1, -0.2, 0.9))
     before = urdf.read_bytes()
@@ -242,11 +234,12 @@ def test_a_urdf_of_another_mounting_is_refused_unless_forced(tmp_path, saved, ca
     assert difference(mounted(urdf), corrected(saved)) < 1e-8
 
 
-def test_another_file_leaves_the_urdf_as_it_is(tmp_path, saved):
+def test_another_file_leaves_the_urdf_as_it_is_and_without_a_lever_arm_the_position(tmp_path, saved):
     urdf = robot(tmp_path / "robot.urdf")
     before = urdf.read_bytes()
     assert apply(saved, "--urdf", urdf, "-o", tmp_path / "new.urdf") == 0
     assert urdf.read_bytes() == before and not (tmp_path / "robot.urdf.bak").exists()
+    np.testing.assert_array_equal(place(tmp_path / "new.urdf"), place(urdf))
     assert difference(mounted(tmp_path / "new.urdf"), corrected(saved)) < 1e-8
 
 
@@ -594,10 +587,3 @@ def test_a_urdf_with_another_position_is_moved_by_force_only_or_turned_alone(tmp
     assert difference(mounted(urdf), corrected(saved)) < 1e-8
     assert apply(saved, "--urdf", urdf, "--force") == 0
     np.testing.assert_allclose(place(urdf), parsed(saved.read_text())["mounting"]["lever_arm"], atol=1e-8)
-
-
-def test_a_calibration_without_a_lever_arm_leaves_the_position_where_it_is(tmp_path, saved):
-    urdf = robot(tmp_path / "robot.urdf")
-    there = place(urdf)
-    assert apply(saved, "--urdf", urdf) == 0
-    np.testing.assert_array_equal(place(urdf), there)
