@@ -121,7 +121,7 @@ def difference(a: Rotation, b: Rotation) -> float:
 # ---------------------------------------------------------------- URDF
 
 
-def test_the_urdf_has_the_corrected_mounting_and_every_other_byte_as_before_also_applied_twice(tmp_path, saved, capsys):
+def test_the_urdf_has_the_corrected_mounting_and_every_other_byte_as_before(tmp_path, saved, capsys):
     urdf = robot(tmp_path / "robot.urdf")
     before = urdf.read_bytes()
     assert difference(mounted(urdf), corrected(saved)) > math.radians(1.0)
