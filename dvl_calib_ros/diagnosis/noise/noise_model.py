@@ -204,25 +204,6 @@ class Noise:
         return any(arma.ratio > 1.0 for arma in self.axes)
 
     @property
-    def energy(self) -> Array:
-        """Return the variance (M,) of all axes together."""
-        return np.asarray(self.level**2 @ self._variances)
-
-    @property
-    def energy_error(self) -> float:
-        """Return the relative standard error of the mean energy.
-
-        M samples of an autoregression hold M (1 - ar²) / (1 + ar²) independent squares.
-        """
-        squares = np.array([float(arma.ar[0]) ** 2 if len(arma.ar) else 0.0 for arma in self.axes])
-        errors = self._variances * np.sqrt(2.0 * (1.0 + squares) / (1.0 - squares) / len(self.level))
-        return float(np.linalg.norm(errors) / self._variances.sum())
-
-    @property
-    def _variances(self) -> Array:
-        return np.array([(arma.std * arma.ratio) ** 2 for arma in self.axes])
-
-    @property
     def white(self) -> Noise:
         """Return white noise of the same size."""
         axes = tuple(Arma(np.zeros(0), 0.0, arma.std * arma.ratio, 1.0) for arma in self.axes)
