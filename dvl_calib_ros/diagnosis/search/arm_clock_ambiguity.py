@@ -86,6 +86,32 @@ def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) ->
     }
 
 
+def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> Fit:
+    """Return a fit with registration's clocks and the lever arm, where these are ambiguous.
+
+    Return the fit unchanged if it has no clock, or if it is significantly better.
+    """
+    present = [effect.name for effect in fit.effects]
+    own = [name for name in TWO_CLOCKS if name in present]
+    if not own or ARM not in effects or not is_open(guesses):
+        return fit
+    registered = {name for each in guesses if each.registration is not None for name in each.registration.offsets}
+    clocks = [name for name in TWO_CLOCKS if name in registered] or own
+    if not registered <= {*TWO_CLOCKS} or {*clocks, ARM} == {*own, *(name for name in present if name == ARM)}:
+        return fit
+    others = [effect for effect in fit.effects if effect.name not in (*TWO_CLOCKS, ARM)]
+    start: dict[str, tuple[Values, ...]] = {
+        ARM: (guessed_arm(guesses, effects),) * len(guesses),
+        DVL_CLOCK: tuple({"seconds": each.offsets.dvl} for each in guesses),
+        REFERENCE_CLOCK: tuple({"seconds": each.offsets.reference} for each in guesses),
+    }
+    effects_to_fit = [*others, effects[ARM], *(effects[name] for name in clocks if name in effects)]
+    if len(effects_to_fit) > SETTINGS.max_effects:
+        return fit
+    found = fitter.fit_kept(fit.hypothesis.with_effects(effects_to_fit, len(guesses), start), fit.noise)
+    return found if found.deviance < fit.deviance + SETTINGS.indistinguishable else fit
+
+
 def with_clocks(
     fitter: Fitter,
     fit: Fit,

@@ -32,6 +32,7 @@ from .arm_clock_ambiguity import (
     arm_ambiguity,
     arm_change,
     is_open,
+    with_arm,
     with_clocks,
 )
 from .candidates import combined, linearised
@@ -68,10 +69,11 @@ def identify_effects(
     fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], swaps: Mapping[str, str]
 ) -> Identifiability:
     """Test each effect of a fit and its substitutes. swaps: by effect name, a substitute that is equally likely."""
+    selection, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     trade_off = arm_ambiguity(guesses) if ARM in fit.values else None
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects), trade_off)
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), selection, trade_off)
     selected = [_with_equivalents(each, [swaps[n]]) if (n := each.effect.name) in swaps else each for each in selected]
     rivals = [one for each in selected if trade_off is not None and each.effect.name in CLOCKS for one in each.rivals]
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), trade_off)
@@ -132,6 +134,7 @@ def _clock_or_arm(
     fit: Fit,
     selected: list[Selected],
     n_effects: int,
+    selection: Sequence[Effect],
     trade_off: ArmAmbiguity | None,
 ) -> list[Selected]:
     """Merge lever arm and clock into one entry if each is insignificant given the other.
@@ -154,6 +157,8 @@ def _clock_or_arm(
     if arm is None or not clocks:
         return selected
     clock = min(clocks, key=lambda each: each.log_p)
+    dropped = [each for each in clocks if each is not clock and each.effect not in selection and not passes(each)]
+    selected = [each for each in selected if each not in dropped]
     if passes(arm) and passes(clock):
         return selected
     kept, other = (arm, clock) if passes(arm) else (clock, arm)

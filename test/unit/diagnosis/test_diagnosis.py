@@ -47,7 +47,7 @@ from dvl_calib_ros.diagnosis.search.effect_selection import (
     started,
     with_noise_reestimated,
 )
-from dvl_calib_ros.diagnosis.search.identifiability import _selected
+from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.search.observable_parameters import (
     observable_parts,
     with_observable,
@@ -181,6 +181,18 @@ def test_a_clock_of_the_imu_is_told_beside_a_current_that_comes_and_goes():
     assert_within(diagnosis, "attitude_time_offset", seconds=-0.87)
     times = found(diagnosis)["water_lock"]
     assert (times["from_s"], times["to_s"]) == pytest.approx((111.0, 248.0), abs=8.0)
+
+
+def test_a_clock_that_only_stands_beside_an_arm_is_not_named_unless_it_is_shown():
+    """With twelve others that could as well be meant, for none was."""
+    late = {"reference_time_offset": {"seconds": -0.5}}
+    fitter, fit, _ = fitted(
+        scenario(effects=["reference_time_offset:seconds=-0.5"], seed=1),
+        {"lever_arm": {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0}, "dvl_time_offset": {"seconds": 0.0}, **late},
+    )
+    selected = [_selected(fitter, fit, effect, EFFECTS) for effect in fit.effects]
+    kept = _clock_or_arm(fitter, fit, selected, len(EFFECTS), [EFFECTS["reference_time_offset"]], None)
+    assert [each.effect.name for each in kept] == ["reference_time_offset"]
 
 
 @pytest.mark.parametrize(("behind", "could_be"), [(8.0, True), (13.0, False)])

@@ -292,7 +292,7 @@ def in_cm_per_s(path: Path) -> None:
 
 BAD = {
     "a missing trajectory": (lambda f: (f / "T07_dvl.csv").unlink(), "T07_dvl.csv missing", "--partial"),
-    "a missing calibration run": (lambda f: (f / "T14_dvl.csv").unlink(), "T14_dvl.csv missing", "takes T12"),
+    "a missing calibration run": (lambda f: (f / "T14_dvl.csv").unlink(), "T14_dvl.csv missing", "needs T12"),
     "a calibration run shorter than its window": (
         lambda f: keep_rows(f / "T12_dvl.csv", 150), "T12_dvl.csv: ends at row 150 after 150 s", "needs 200 s",
     ),
