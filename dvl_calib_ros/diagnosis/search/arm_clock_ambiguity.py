@@ -71,6 +71,12 @@ def is_open(guesses: Sequence[FirstGuess]) -> bool:
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
 
 
+def separable_clocks(guesses: Sequence[FirstGuess]) -> set[str]:
+    """Return the clock offsets of recordings that leave less than `AMBIGUITY_M` of the lever arm open to a clock."""
+    found = [each.registration for each in guesses if each.registration is not None]
+    return {name for each in found if np.trace(each.left_open[3:6, 3:6]) < AMBIGUITY_M**2 for name in each.offsets}
+
+
 def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> dict[str, float]:
     """Return the lever arm to start from, the median of recordings; unobservable parts only where registered well.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,6 +32,7 @@ from .arm_clock_ambiguity import (
     arm_ambiguity,
     arm_change,
     is_open,
+    separable_clocks,
     with_arm,
     with_clocks,
 )
@@ -73,7 +74,7 @@ def identify_effects(
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     trade_off = arm_ambiguity(guesses) if ARM in fit.values else None
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects), selection, trade_off)
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), selection, trade_off, separable_clocks(guesses))
     selected = [_with_equivalents(each, [swaps[n]]) if (n := each.effect.name) in swaps else each for each in selected]
     rivals = [one for each in selected if trade_off is not None and each.effect.name in CLOCKS for one in each.rivals]
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), trade_off)
@@ -136,11 +137,13 @@ def _clock_or_arm(
     n_effects: int,
     selection: Sequence[Effect],
     trade_off: ArmAmbiguity | None,
+    clear: Collection[str] = (),
 ) -> list[Selected]:
     """Merge lever arm and clock into one entry if each is insignificant given the other.
 
     selection: selected effects; a further clock is named only if significant. trade_off: from `arm_ambiguity`; a
-    reference delay within that ambiguity is insignificant.
+    reference delay within that ambiguity is insignificant. clear: from `separable_clocks`; an insignificant arm is no
+    alternative to these clocks.
     """
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
@@ -161,6 +164,8 @@ def _clock_or_arm(
     selected = [each for each in selected if each not in dropped]
     if passes(arm) and passes(clock):
         return selected
+    if passes(clock) and clock.effect.name in clear and arm.log_p > threshold:
+        return [each for each in selected if each is not arm]
     kept, other = (arm, clock) if passes(arm) else (clock, arm)
     remaining = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
     without = fitter.fit_kept(fit.hypothesis.with_effects(remaining, fit.n_recordings, {}), fit.noise)
