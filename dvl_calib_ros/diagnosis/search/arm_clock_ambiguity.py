@@ -23,6 +23,8 @@ TWO_CLOCKS = DVL_CLOCK, REFERENCE_CLOCK
 # Alternatives for a delayed reference, and the delay from which each is tried for the other, s
 LAG_OR_DELAY, LAG_FROM_S = (LAG, REFERENCE_CLOCK), 0.2
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
+# At one speed, arm and clock are inseparable if a joint fit inflates the arm's σ by this factor
+MAX_INFLATION = 3.5
 # Ambiguity of the arm, m, from which registration limits the precision of arm and clock
 AMBIGUITY_M = 0.1
 
@@ -147,7 +149,7 @@ def with_clocks(
     is_another = ~is_shown | ((trade_off is not None) & (np.abs(free - own) > Z_INTERVAL * by_chance))
     if bool((was_shown & is_another & (free_std > 2.0 * own_std)).any()):
         return joint
-    return fit
+    return None if trade_off is not None and bool((was_shown & (free_std > MAX_INFLATION * own_std)).any()) else fit
 
 
 def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
@@ -178,10 +180,19 @@ def arm_change(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
     return max(moved, key=lambda each: sum(by**2 for by in each.values()), default={})
 
 
+def lag_change(fit: Fit, joint: Fit) -> dict[str, float]:
+    """Return the change (s) of a lag from a joint fit with more clocks, if both are equally likely."""
+    if not {LAG} <= fit.values.keys() & joint.values.keys():
+        return {}
+    if fit.deviance > joint.deviance + SETTINGS.indistinguishable:
+        return {}
+    return {name: value - joint.values[LAG][0][name] for name, value in fit.values[LAG][0].items()}
+
+
 def with_changes(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
-    """Return a covariance (6 + p, 6 + p) that includes changes from `arm_change`."""
+    """Return a covariance (6 + p, 6 + p) that includes changes from `arm_change` and `lag_change`."""
     step = np.zeros(len(covariance))
-    for name, i in _indices(fit, ARM).items():
+    for name, i in (_indices(fit, ARM) | _indices(fit, LAG)).items():
         step[i] = moved.get(name, 0.0)
     return np.asarray(covariance + np.outer(step, step))
 

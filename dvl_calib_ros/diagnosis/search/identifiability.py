@@ -32,6 +32,7 @@ from .arm_clock_ambiguity import (
     arm_ambiguity,
     arm_change,
     is_open,
+    lag_change,
     separable_clocks,
     with_arm,
     with_clocks,
@@ -90,7 +91,7 @@ def identify_effects(
             _with_equivalents(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
         ]
-    fit, changes = (fit, arm_change(fit, rivals)) if freed is None or freed is fit else (freed, {})
+    fit, changes = (fit, arm_change(fit, rivals)) if freed is None or freed is fit else (freed, lag_change(fit, freed))
     if any(each.registration is not None and each.registration.ambiguity for each in guesses):
         selected = [
             _with_equivalents(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected

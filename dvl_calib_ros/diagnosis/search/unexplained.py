@@ -212,7 +212,7 @@ def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Un
         new = find_unexplained(fitter, reduced.fit)
         if not new.found or is_of_group(problem, fit, out, new.about):
             continue
-        chance = max(SETTINGS.indistinguishable, 2.0 * new.log_tried)  # the best of several regressors is chosen
+        chance = SETTINGS.indistinguishable + new.log_tried  # more, as the best of several regressors is chosen
         gain = _held_out_gain(problem, fit, reduced.fit, new) - chance - INTERPOLATION_SHARE * drop
         if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, new
