@@ -92,6 +92,7 @@ CASES = {
     ("DVL_AXES_TURNED", "axes by the messages"): of_wrong("z flipped"),
     ("DVL_AXES_TURNED", "axes given"): of_wrong("z flipped")._replace(given={"dvl_axes": "flu"}),
     ("REFERENCE_LOOKS", "ENU, body claimed"): of_wrong("ENU, body claimed"),
+    ("REFERENCE_LOOKS", "NED, body claimed"): of_wrong("NED, body claimed"),
     ("IMU_LOOKS_NED", "IMU in NED"): of_wrong("IMU in NED"),
     ("IMU_LOOKS_NED", "IMU in ENU, NED given"): Case(
         lambda path: write_bag(path, run()), {"imu_frame": "ned", "imu_rpy": (math.pi, 0.0, 0.0)}
@@ -101,9 +102,11 @@ CASES = {
     ("CLOCK_LATE", "offset of the reference given"): Case(
         with_nothing_wrong, {"reference_time_offset": 1.0}, is_discovered=True
     ),
+    ("CLOCK_LATE", "offset given"): Case(with_nothing_wrong, {"imu_time_offset": 1.0}, is_discovered=True),
     ("CLOCKS_LATE", "reference and DVL"): late(reference=0.6)._replace(given={"dvl_time_offset": 0.5}),
     ("CLOCK_DRIFTS_DVL", "drift given"): Case(with_nothing_wrong, {"dvl_clock_drift": 0.009}, is_discovered=True),
     ("MOUNTING_CONTRADICTED", "declination of 14 degrees"): without_declination(14.0),
+    ("MOUNTING_CONTRADICTED", "declination of -60 degrees"): without_declination(-60.0),
 }
 
 

@@ -159,7 +159,7 @@ def test_sigma_of_few_blocks_is_wrong_by_three_of_it_no_more_often_than_that_of_
     """Surveys 34211, 38246: pitch was off by 3.1 and 3.3 σ of 24 blocks."""
     rng, off = np.random.default_rng(5), []
     share = np.where(np.arange(count) % 3 == 0, told, 1.0)
-    for _ in range(2000):
+    for _ in range(4000):
         blocks, means = TimeBlocks(), rng.normal(0.0, 3.0 / np.sqrt(share))
         for weight, mean in zip(share, means, strict=True):
             blocks.add(np.array([[[weight]]]), np.array([[weight * mean]]), 1.0)

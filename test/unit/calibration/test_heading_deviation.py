@@ -71,7 +71,7 @@ def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
 )
 def test_yaw_is_within_its_sigma(every, size):
     off = []
-    for seed in range(3):
+    for seed in range(4):
         deviates = lambda yaw, _, at=seed: math.radians(size) * math.sin(yaw + 1.6 * at)  # noqa: E731
         calibrator, *_ = recorded(seed, deviates, legs=16, every=every)
         estimate = calibrator.estimate("full")

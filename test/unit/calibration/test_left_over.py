@@ -195,7 +195,7 @@ def test_a_bias_is_named_from_the_level_of_a_recordings_tests(rng):
 @pytest.mark.slow
 def test_few_turns_show_a_bias_or_a_filter_no_more_surely_than_few_can():
     """Of six legs a bias of nothing was found at 3.8 σ, and smoothing at 2.9, from which on a filter is believed."""
-    found = [Vehicle(np.random.default_rng(seed), seconds=250.0, wave_deg=0.1).found() for seed in range(30)]
+    found = [Vehicle(np.random.default_rng(seed), seconds=250.0, wave_deg=0.1).found() for seed in range(60)]
     assert max(abs(each.smoothed) / each.smoothed_std for each in found) < 2.4
     assert np.max([np.abs(each.bias) / each.bias_std for each in found]) < 3.7
     assert np.std([each.smoothed / each.smoothed_std for each in found]) > 0.5

@@ -89,10 +89,10 @@ def test_roll_and_pitch_of_the_mounting_are_not_claimed_where_only_noise_of_the_
     assert low < YAW < high
 
 
-def test_at_one_speed_an_early_reference_is_named_and_the_interval_of_the_arm_holds_what_it_may_be():
+@pytest.mark.parametrize(("seed", "late"), [(0, 0.4), (1, -0.5)])
+def test_at_one_speed_a_late_reference_is_named_and_the_interval_of_the_arm_holds_what_it_may_be(seed, late):
     """The arm was said to be 0.4 m further astern, to 3 cm, and nothing of a clock."""
-    late = -0.5
-    effects = found(diagnose_recordings([boat(1, 0.3, reference_late=late)], Parameters()))
+    effects = found(diagnose_recordings([boat(seed, 0.3, reference_late=late)], Parameters()))
     names = {name for each in effects.values() for name in (each.name, *each.equivalent_to)}
     assert {"lever_arm", "reference_time_offset"} <= names
     if "lever_arm" in effects:

@@ -22,7 +22,7 @@ from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
 
-DRAWS = 20
+DRAWS = 40
 BIAS = np.array([0.036, -0.027, 0.018])
 
 
@@ -84,7 +84,7 @@ def _true_closure(clean: Fitter, found) -> float:
     left = []
     for hypothesis in (no_effect(), found):
         seen, residual = clean.evaluated(hypothesis)
-        columns = clean.columns(hypothesis, seen)[:, :, :6].reshape(-1, 6)
+        columns = clean.problem.all_columns(hypothesis, seen)[:, :, :6].reshape(-1, 6)
         series = residual.ravel()
         left.append(np.sum((series - columns @ np.linalg.lstsq(columns, series)[0]) ** 2))
     return float(1.0 - left[1] / left[0])
