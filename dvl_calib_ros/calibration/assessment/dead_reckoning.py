@@ -175,18 +175,25 @@ def dead_reckoned(
     kept = np.round(np.linspace(0, len(used) - 1, min(MAP_POINTS, len(used)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
-        distance_m=float(distance[-1]), seconds=float(step_s.sum()),
+        distance_m=float(distance[-1]),
+        seconds=float(step_s.sum()),
         stretch_m=float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]]),
-        stretches=len(ends) - 1, before=drift_over(track_errors[0], distance, ends),
+        stretches=len(ends) - 1,
+        before=drift_over(track_errors[0], distance, ends),
         after=drift_over(track_errors[1], distance, ends),
-        noise_per_km=_noise(errors[1], step_s, distance, ends, slow), on_a_map=on_a_map,
+        noise_per_km=_noise(errors[1], step_s, distance, ends, slow),
+        on_a_map=on_a_map,
         stamps_ns=np.round(recording.dvl.times[used[kept]] * 1e9).astype(np.int64) + epoch_ns,
-        distances=distance[kept], reference=reference[kept], track_before=(reference - track_errors[0])[kept],
-        track_after=(reference - track_errors[1])[kept], error_before=before.in_body[used[kept]],
+        distances=distance[kept],
+        reference=reference[kept],
+        track_before=(reference - track_errors[0])[kept],
+        track_after=(reference - track_errors[1])[kept],
+        error_before=before.in_body[used[kept]],
         error_after=after.in_body[used[kept]],
         deviation=heading_deviation(after.yaw[used], heading) if on_a_map and heading is not None else None,
-        followed=_followed(recording, after, used, parameters) if on_a_map else None, beam=beam,
-    )  # fmt: skip
+        followed=_followed(recording, after, used, parameters) if on_a_map else None,
+        beam=beam,
+    )
 
 
 class _Level(NamedTuple):

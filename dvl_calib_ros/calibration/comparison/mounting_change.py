@@ -276,10 +276,18 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
         value[index], by_bias[index] = p @ (vector[index] - gain @ bias_vector), p @ gain
         covariance[np.ix_(index, index)] = p - by_bias[index] @ by_bias[index].T
     return replace(
-        base, name=f"{len(several)} together", model=" ".join(dict.fromkeys(each.model for each in several)),
-        last_ns=max(each.last_ns for each in several), value=value, covariance=covariance + by_bias @ by_bias.T,
-        shown=observable, dvl=several[0].dvl, by_bias=by_bias, used=sum(each.used for each in several), remarks=(),
-    )  # fmt: skip
+        base,
+        name=f"{len(several)} together",
+        model=" ".join(dict.fromkeys(each.model for each in several)),
+        last_ns=max(each.last_ns for each in several),
+        value=value,
+        covariance=covariance + by_bias @ by_bias.T,
+        shown=observable,
+        dvl=several[0].dvl,
+        by_bias=by_bias,
+        used=sum(each.used for each in several),
+        remarks=(),
+    )
 
 
 _Together = Callable[[tuple[Extrinsics, ...]], Extrinsics]

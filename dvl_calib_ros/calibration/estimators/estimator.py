@@ -222,7 +222,7 @@ class Estimator(ABC):
         return None
 
     def settle(self) -> None:
-        """Solve what is gathered, and let it take effect."""
+        """Solve for the gathered data, and let the solution take effect."""
         return None
 
     @contextmanager

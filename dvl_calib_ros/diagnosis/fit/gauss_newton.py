@@ -170,17 +170,13 @@ class Fitter:
         seen = tuple(self.problem.all_seen(hypothesis))
         return seen, self.problem.residual(seen) - self.outliers
 
-    def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
-        """Return derivatives of the residual, (M, A, 6 + p)."""
-        return self.problem.all_columns(hypothesis, seen)
-
     def _linearised(
         self, hypothesis: Hypothesis, noise: Noise, seen: tuple[Seen, ...] | None = None, residual: Array | None = None
     ) -> _Linearisation:
         """Linearise a hypothesis. seen, residual: its evaluation, if known."""
         if seen is None or residual is None:
             seen, residual = self.evaluated(hypothesis)
-        columns = self.columns(hypothesis, seen)
+        columns = self.problem.all_columns(hypothesis, seen)
         return _Linearisation(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
 
     def _whiten(self, noise: Noise, values: Array) -> Array:

@@ -17,6 +17,10 @@ from ...calibration.numerics.distributions import normal_isf
 from ...calibration.numerics.frames import Array
 from .settings import SETTINGS
 
+# Largest exponent: if standard deviations are written as variances, the reported values are square roots
+MAX_EXPONENT = 2.0
+# Bound of the log noise level about its mean, so that one sample with a wrong claim does not decide alone
+MAX_LOG_LEVEL = 4.0
 # Least standard deviation of the logarithm of reported values that is informative
 MIN_LOG_STD = 0.05
 
@@ -69,8 +73,8 @@ def relative_std(log_claims: Array, values: Array, names: Sequence[str], stretch
     while kept:
         found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
         if found.is_significant.all():
-            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ found.exponents
-            return np.asarray(np.exp(logarithm))
+            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, MAX_EXPONENT)
+            return np.asarray(np.exp(np.clip(logarithm, -MAX_LOG_LEVEL, MAX_LOG_LEVEL)))
         kept.pop(int(np.argmin(found.exponents / found.stds)))
     return np.ones(values.shape)
 
@@ -98,4 +102,4 @@ def relative_noise(time: Array, sample_std: Array | None, differences: Array, we
     if not found.is_significant.all():
         return np.ones(shape)
     median = np.median(sample_std, axis=0)
-    return np.asarray((sample_std / median) ** float(found.exponents[0]))
+    return np.asarray((sample_std / median) ** min(float(found.exponents[0]), MAX_EXPONENT))

@@ -49,7 +49,7 @@ def hypotheses_with_jumps(
 ) -> list[Hypothesis]:
     """Return hypotheses with clock jumps at the delay changes of one recording, replacing effects that resemble jumps.
 
-    once, every: effects with one and with two jumps. Empty if the fit has no effect of time.
+    single, every: effects with one and with two jumps. Empty if the fit has no effect of time.
     """
     present = {effect.name for effect in fit.effects}
     if fit.n_recordings > 1 or LEAP not in single or not present & {*OF_TIME}:

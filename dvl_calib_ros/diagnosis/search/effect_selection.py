@@ -71,7 +71,7 @@ class EffectSelection:
     def without(self, names: Collection[str]) -> EffectSelection:
         """Return the selection without the named effects; re-estimate the others."""
         kept = [effect for effect in self.fit.effects if effect.name not in names]
-        hypothesis = self.fit.hypothesis.with_effects(kept, len(self.fit.seen), {})
+        hypothesis = self.fit.hypothesis.with_effects(kept, self.fit.n_recordings, {})
         selected = tuple(each for each in self.selected if each.effect.name not in names)
         return replace(self, selected=selected, fit=self.fitter.fit(hypothesis, self.fit.noise))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,21 +75,22 @@ class Unexplained:
 def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     """Return the regressor with the most significant score test that predicts held-out stretches of a residual."""
     problem, noise = fitter.problem, fit.noise
-    basis, white = _orthogonal_residual(fitter, fit, problem, fit.seen, fit.residual)
+    basis, white = _orthogonal_residual(problem, fit, fit.seen, fit.residual)
     of_motion = _score_tests(problem, fit, fit.seen, basis, white)
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
     whitened = noise.whiten(fit.residual)
     whitened = whitened / np.sqrt(float(whitened @ whitened) / (whitened.size - basis.shape[1]))
     spectral = lines(problem, whitened.reshape(-1, problem.axes))
-    base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), noise)
-    left = INTERPOLATION_SHARE * (base.deviance - fit.deviance)
-    of_time = [each._replace(left=left) for each in spectral + events(problem, fit, basis, white)]
+    of_time = spectral + events(problem, fit, basis, white)
     log_p = min(each.log_p for each in of_motion + of_time)
     none = fit.columns[:, :, :0]
     if log_p > np.log(SETTINGS.robust_level):
         return Unexplained(min(log_p, 0.0), "", none, none)
-    proposed = sorted(_inflated(fitter, fit, of_motion) + of_time, key=lambda each: each.log_p)[:N_PREDICTED]
+    base = fitter.fit_kept(fit.hypothesis.with_effects([], fit.n_recordings, {}), noise)
+    left = INTERPOLATION_SHARE * (base.deviance - fit.deviance)
+    of_time = [each._replace(left=left) for each in of_time]
+    proposed = sorted(_inflated(problem, fit, of_motion) + of_time, key=lambda each: each.log_p)[:N_PREDICTED]
     log_p = 0.0
     for each in proposed:
         log_p = min(log_p, _predicted(problem, fit, each).log_p)
@@ -112,15 +113,13 @@ def _predicted(problem: Problem, fit: Fit, regressor: Regressor) -> Regressor:
     return regressor._replace(energy=max(gain - regressor.left + c, 0.0), dof=c)
 
 
-def _orthogonal_residual(
-    fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
-) -> tuple[Array, Array]:
+def _orthogonal_residual(problem: Problem, fit: Fit, seen: Sequence[Seen], residual: Array) -> tuple[Array, Array]:
     """Return an orthonormal basis (M A + k, r) of a fit's whitened columns, and a whitened residual of unit variance.
 
     problem, seen, residual: of the recordings or of simulated ones. Basis and residual end with the rows of the prior,
     and the residual is orthogonal to the basis.
     """
-    columns = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
+    columns = problem.all_columns(fit.hypothesis, seen)
     nuisance, noise = NuisanceFit.of(problem, fit.hypothesis, seen, columns), fit.noise
     q, white = _orthogonal_to_nuisances(nuisance, noise.whiten(nuisance.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
@@ -139,11 +138,11 @@ def _score_tests(problem: Problem, fit: Fit, seen: Sequence[Seen], basis: Array,
     return [each._replace(log_tried=float(np.log(len(found)))) for each in found]
 
 
-def _inflated(fitter: Fitter, fit: Fit, of_motion: Sequence[Regressor]) -> list[Regressor]:
+def _inflated(problem: Problem, fit: Fit, of_motion: Sequence[Regressor]) -> list[Regressor]:
     """Return regressors with the inflation of their energies over chi-square in simulated recordings, at least 1."""
     energy, dof = np.full(len(of_motion), PRIOR_DOF), np.full(len(of_motion), PRIOR_DOF)
-    for simulated, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
-        tests = _score_tests(simulated, fit, seen, *_orthogonal_residual(fitter, fit, simulated, seen, residual))
+    for simulated, seen, residual in simulated_recordings(problem, fit, SIMULATED):
+        tests = _score_tests(simulated, fit, seen, *_orthogonal_residual(simulated, fit, seen, residual))
         energy += [test.energy for test in tests]
         dof += [test.dof for test in tests]
     inflation = np.maximum(energy / dof, 1.0).tolist()

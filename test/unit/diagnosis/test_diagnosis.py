@@ -1062,8 +1062,7 @@ def test_the_derivatives_beside_a_lag_are_those_of_what_lags(name):
     lag, effect = EFFECTS["reference_lag"], EFFECTS[name]
     values = {lag.name: ({"time_constant_s": 1.3},), name: (effect.defaults,)}
     about = no_effect().with_effects([lag, effect], 1, values)
-    fitter = Fitter(problem)
-    columns = fitter.columns(about, problem.all_seen(about))
+    columns = problem.all_columns(about, problem.all_seen(about))
     for number in (0, 1, 2, 3, *range(7, columns.shape[2])):  # scales of sway and heave do next to nothing
         step = np.zeros(columns.shape[2])
         step[number] = 0.01

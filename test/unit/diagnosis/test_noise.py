@@ -395,3 +395,13 @@ def test_an_event_is_whitened_from_the_bins_about_it_alone(rng):
     np.testing.assert_allclose(noise.part(about).whiten(event[about]).reshape(-1, 3), whole[about], atol=1e-9)
     assert about.stop < 250
     np.testing.assert_allclose(whole[about.stop :], 0.0, atol=1e-9)
+
+
+def test_a_sample_with_an_absurd_claim_does_not_decide_alone():
+    """It had five million times the weight of the others."""
+    rng = np.random.default_rng(0)
+    true = np.exp(rng.normal(0.0, 1.0, (900, 1)))
+    claims = np.repeat(np.log(true), 3, axis=1)[:, :, None]
+    claims[6] -= 9.0
+    level = relative_std(claims, rng.normal(size=(900, 3)) * true, ["dvl"], np.arange(900) // 20)
+    assert np.ptp(level) > 0.0 and level.min() >= np.exp(-4.0)
