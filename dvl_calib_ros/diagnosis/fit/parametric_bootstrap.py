@@ -33,7 +33,7 @@ class _AkimaCurve(Curve):
 
     @cached_property
     def _spline(self) -> Akima1DInterpolator:
-        return Akima1DInterpolator(self.time, self.values)
+        return Akima1DInterpolator(self.time, self.steady)
 
     @cached_property
     def smooth(self) -> Curve:
@@ -73,7 +73,7 @@ def _moving(recording: RecordedStreams) -> RecordedStreams:
     def through(curve: Curve | None) -> Curve | None:
         if curve is None or curve.interval <= FAST_ENOUGH_S or len(curve.time) < 5:
             return curve
-        return _AkimaCurve(curve.time, curve.values)
+        return _AkimaCurve(curve.time, curve.values, frame=curve.frame)
 
     dvl = recording.dvl.smooth
     return replace(
@@ -86,7 +86,7 @@ def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.r
 
     def noisy(curve: Curve, values: Array) -> Curve:
         noise = share * curve.noise * curve.relative_noise * rng.standard_normal(values.shape)
-        return Curve(curve.time, values + noise, curve.reported, sample_std=curve.sample_std)
+        return replace(curve, values=values + noise, like=None)
 
     return replace(
         recording,

@@ -52,7 +52,7 @@ from .seen import (
     without_remembered,
 )
 from .settings import SETTINGS
-from .stream_curve import FAST_ENOUGH_S, segments_of
+from .stream_curve import FAST_ENOUGH_S, TurningFrame, segments_of
 from .time_grid import Grid, Offsets, make_grid
 
 
@@ -486,9 +486,30 @@ def make_problem(
     recordings: Sequence[RecordedStreams], rotation_dvl_from_body: Array, lever_arm: Array, offsets: Sequence[Offsets]
 ) -> Problem:
     """Make the problem on bins where all streams are available, at the initial offsets and at none."""
+    lever_arm = np.asarray(lever_arm, dtype=float)
+    recordings = [
+        _with_turning_dvl(recording, rotation_dvl_from_body, lever_arm, offset.dvl)
+        for recording, offset in zip(recordings, offsets, strict=True)
+    ]
     grids = tuple(make_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
-    problem = Problem(tuple(recordings), rotation_dvl_from_body, np.asarray(lever_arm, dtype=float), grids)
+    problem = Problem(tuple(recordings), rotation_dvl_from_body, lever_arm, grids)
     return problem if problem.measured[2] else replace(problem, observable_turns=_observable_turns(problem))
+
+
+def _with_turning_dvl(
+    recording: RecordedStreams, rotation_dvl_from_body: Array, lever_arm: Array, delay_s: float
+) -> RecordedStreams:
+    """Interpolate a slow DVL in the earth's frame. delay_s: of the DVL's stamps."""
+    if recording.attitude is None or recording.dvl.interval <= FAST_ENOUGH_S:
+        return recording
+
+    def rotation(at: Array) -> Array:
+        return rotation_dvl_from_body @ recording.rotation_enu_from_body(at - delay_s).swapaxes(1, 2)
+
+    def swing(at: Array) -> Array:
+        return cross(recording.angular_velocity(at - delay_s), lever_arm) @ rotation_dvl_from_body.T
+
+    return replace(recording, dvl=replace(recording.dvl, frame=TurningFrame(rotation, swing)))
 
 
 # Mounting rotations that act by less than this (m/s RMS) at their prior size are not fitted: they would absorb the

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ NOISE_POWER_RATIO, MOTION_POWER_RATIO = 1.4, 2.5
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Longest interval, s, of a stream that resolves turns and waves: only its noise is removed; samples per smoothing cubic
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
+# Half width, s, of the difference for the derivative in a turning frame
+DERIVATIVE_S = 0.05
 # Largest product of the intervals to both neighbours, in usual intervals; at the middle of two samples it is 0.25
 MAX_NEIGHBOUR_PRODUCT = 0.4
 
@@ -50,17 +52,29 @@ class EvaluationCache:
         return made
 
 
+class TurningFrame(NamedTuple):
+    """Frame in which a velocity is measured, as functions of times (M,) s.
+
+    rotation: (M, 3, 3) from the earth's frame. swing: (M, 3) m/s, velocity by the vehicle's rotation, in this frame.
+    """
+
+    rotation: Callable[[Array], Array]
+    swing: Callable[[Array], Array]
+
+
 @dataclass(frozen=True, eq=False)
 class Curve:
     """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). reported: (k,)
     reported standard deviation. like: curve of the same stream without simulated noise, which defines the noise level.
-    sample_std: (N, k) standard deviation reported per sample."""
+    sample_std: (N, k) standard deviation reported per sample. frame: of a slow stream, which is then interpolated in
+    the earth's: in waves a vehicle rolls between two samples at 1 Hz, but hardly changes its velocity over ground."""
 
     time: Array
     values: Array
     reported: Array | None = None
     like: Curve | None = None
     sample_std: Array | None = None
+    frame: TurningFrame | None = None
     kept: EvaluationCache = field(init=False, default_factory=EvaluationCache, repr=False)
 
     @cached_property
@@ -70,12 +84,25 @@ class Curve:
 
     @cached_property
     def _spline(self) -> Any:
-        return make_interp_spline(self.time, self.values, k=min(3, len(self.time) - 1))
+        return make_interp_spline(self.time, self.steady, k=min(3, len(self.time) - 1))
 
     def __call__(self, at: Array) -> Array:
         """Return values (M, k) at times (M,) s, constant beyond the ends."""
-        values: Array = self._spline(np.clip(at, self.time[0], self.time[-1]))
-        return values
+        at = np.clip(at, self.time[0], self.time[-1])
+        return self._measured(at, self._spline(at))
+
+    @cached_property
+    def steady(self) -> Array:
+        """Return the values (N, k); of a turning frame in the earth's, without the swing."""
+        if self.frame is None:
+            return self.values
+        return np.einsum("nji,nj->ni", self.frame.rotation(self.time), self.values - self.frame.swing(self.time))
+
+    def _measured(self, at: Array, steady: Array) -> Array:
+        """Return the values at times (M,) s of `steady` ones (M, k)."""
+        if self.frame is None:
+            return steady
+        return np.einsum("nij,nj->ni", self.frame.rotation(at), steady) + self.frame.swing(at)
 
     @cached_property
     def denoised(self) -> Curve:
@@ -94,14 +121,14 @@ class Curve:
             gain = np.column_stack([_gain(column**2, of) for column, of in zip(spectrum.T, variance, strict=True)])
             own, line = _sines(self.values[part])
             values[part] = line + idst(gain * own, type=2, axis=0, norm="ortho")
-        return Curve(self.time, values)
+        return Curve(self.time, values, frame=self.frame)
 
     @cached_property
     def smooth(self) -> Curve:
         """Return the curve for regressors: `denoised`, or for a slow stream each sample on a local cubic."""
         if self.interval <= FAST_ENOUGH_S or len(self.time) <= SMOOTH_SAMPLES:
             return self.denoised
-        return Curve(self.time, _on_cubics(self.values))
+        return Curve(self.time, self._measured(self.time, _on_cubics(self.steady)), frame=self.frame)
 
     @cached_property
     def stretches(self) -> list[slice]:
@@ -113,7 +140,9 @@ class Curve:
     @cached_property
     def derivative(self) -> Any:
         """Return the derivative (M,) -> (M, k) per s of the unsmoothed curve."""
-        return self._spline.derivative()
+        if self.frame is None:
+            return self._spline.derivative()
+        return lambda at: (self(at + DERIVATIVE_S) - self(at - DERIVATIVE_S)) / (2.0 * DERIVATIVE_S)
 
     @cached_property
     def roughness(self) -> Array:
@@ -125,7 +154,10 @@ class Curve:
             return self.like.roughness
         if len(self.time) < 10:
             return np.zeros(self.values.shape[1])
-        return robust_std(np.diff(self.values, 4, axis=0) / self.relative_noise[2:-2]) / np.sqrt(70.0)
+        fourth = np.diff(self.steady, 4, axis=0)
+        if self.frame is not None:
+            fourth = np.einsum("nij,nj->ni", self.frame.rotation(self.time[2:-2]), fourth)
+        return robust_std(fourth / self.relative_noise[2:-2]) / np.sqrt(70.0)
 
     @cached_property
     def relative_noise(self) -> Array:
@@ -137,7 +169,7 @@ class Curve:
     def part(self, kept: NDArray[np.bool_]) -> Curve:
         """Return the samples selected by a mask (N,)."""
         sample_std = None if self.sample_std is None else self.sample_std[kept]
-        return Curve(self.time[kept], self.values[kept], self.reported, sample_std=sample_std)
+        return Curve(self.time[kept], self.values[kept], self.reported, sample_std=sample_std, frame=self.frame)
 
     @cached_property
     def from_neighbours(self) -> Array:
@@ -169,7 +201,7 @@ class Curve:
     def perturbed(self, rng: np.random.Generator) -> Curve:
         """Return the curve with additional simulated noise of the same size."""
         noise = self.noise * self.relative_noise * rng.standard_normal(self.values.shape)
-        return Curve(self.time, self.values + noise, like=self)
+        return Curve(self.time, self.values + noise, like=self, frame=self.frame)
 
     def covers(self, at: Array) -> NDArray[np.bool_]:
         """Return (M,) whether samples lie on both sides within the largest gap."""

@@ -359,6 +359,40 @@ def test_what_lies_about_a_lost_sample_of_a_slow_stream_is_not_compared():
     assert Curve(*fast["dvl"]).part(np.arange(len(fast["dvl"][0])) != 100).is_complete_at(fast["dvl"][0][5:-5]).all()
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.4])
+def test_a_slow_dvl_on_a_rolling_vehicle_is_interpolated_in_the_earths_frame(delay_s):
+    """In waves of 3.3 s it rolls and pitches between two samples at 1 Hz; its velocity over ground hardly changes."""
+    mounting, arm = Rotation.from_euler("xyz", [0.1, -0.2, 0.8]).as_matrix(), np.array([-0.6, 0.2, -0.3])
+    every_second, between, turn = np.arange(0.0, 200.0), np.arange(2.5, 197.0), 1e-3
+
+    def attitude(time):
+        wave = 2.0 * np.pi * time / 3.3
+        return Rotation.from_euler("ZYX", np.column_stack([0.01 * time, 0.1 * np.sin(wave), 0.2 * np.cos(wave)]))
+
+    def rates(time):
+        return (attitude(time - turn).inv() * attitude(time + turn)).as_rotvec() / (2.0 * turn)
+
+    def earth(time):
+        return np.column_stack([1.5 + 0.002 * time, 0.3 * np.cos(0.05 * time), 0.0 * time])
+
+    def dvl(time):
+        return (attitude(time).inv().apply(earth(time)) + np.cross(rates(time), arm)) @ mounting.T
+
+    time = np.arange(-1.0, 201.0, 0.1)
+    recording = make_recording(
+        "waves",
+        (every_second + delay_s, dvl(every_second)),
+        (every_second, earth(every_second)),
+        attitude=(time, attitude(time).as_quat()),
+        rates=(time, rates(time)),
+    )
+    curve = make_problem([recording], mounting, arm, [Offsets(delay_s)]).recordings[0].dvl
+    of_curve = curve(between + delay_s), curve.smooth(between + delay_s)
+    assert np.abs(of_curve - dvl(between)).max() < 0.005
+    ahead, behind = dvl(between + 0.01), dvl(between - 0.01)
+    assert np.abs(curve.derivative(between + delay_s) - (ahead - behind) / 0.02).max() < 0.03
+
+
 def test_of_a_fit_that_is_far_off_nothing_is_taken_for_an_outlier(rng):
     """All of a lopsided axis was one, divided by the share of none: a null with heavy tails broke the diagnosis."""
     residual = 0.01 * rng.standard_normal((200, 2)) + [0.0, 0.2]
