@@ -66,8 +66,8 @@ class TurningFrame(NamedTuple):
 class Curve:
     """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). reported: (k,)
     reported standard deviation. like: curve of the same stream without simulated noise, which defines the noise level.
-    sample_std: (N, k) standard deviation reported per sample. frame: of a slow stream, which is then interpolated in
-    the earth's: in waves a vehicle rolls between two samples at 1 Hz, but hardly changes its velocity over ground."""
+    sample_std: (N, k) standard deviation reported per sample. frame: of the values, if they are interpolated in the
+    earth's."""
 
     time: Array
     values: Array
@@ -122,6 +122,11 @@ class Curve:
             own, line = _sines(self.values[part])
             values[part] = line + idst(gain * own, type=2, axis=0, norm="ortho")
         return Curve(self.time, values, frame=self.frame)
+
+    @property
+    def bending(self) -> float:
+        """Return the sum of squares of fourth differences, which interpolation errors follow."""
+        return float((np.diff(self.steady, 4, axis=0) ** 2).sum())
 
     @cached_property
     def smooth(self) -> Curve:
