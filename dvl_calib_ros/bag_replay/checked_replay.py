@@ -140,12 +140,12 @@ def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reas
     """
     is_rejected = verification.verdict is Severity.REJECT
     kept = []
-    for each in contradictions:
-        if each.severity is Severity.MARGINAL:
-            kept.append(each)
-        elif each.code in DECISIVE or (is_rejected and is_cause(each)):
-            kept.append(each.weighed(Severity.REJECT))
-    if any(each.code == "MOUNTING_CONTRADICTED" for each in kept):  # which says it with the option to type
+    for contradiction in contradictions:
+        if contradiction.severity is Severity.MARGINAL:
+            kept.append(contradiction)
+        elif contradiction.code in DECISIVE or (is_rejected and is_cause(contradiction)):
+            kept.append(contradiction.weighed(Severity.REJECT))
+    if any(reason.code == "MOUNTING_CONTRADICTED" for reason in kept):  # which says it with the option to type
         reasons = (each for each in verification.reasons if "MOUNTING_FITS" not in {one.code for one in each.causes})
         verification = replace(verification, reasons=tuple(reasons))
     return verification.with_objections(kept) if kept else verification
@@ -202,7 +202,7 @@ def _calibrated_individually(
             unchecked.append(name)
         else:
             found.append(extrinsics)
-    aided = [each for each in found if MODELS[each.model].aided]
+    aided = [reason for reason in found if MODELS[reason.model].aided]
     found = aided or found  # models without GNSS assume no current, so they are not compared with models with GNSS
     try:
         comparison = compare(found) if len(found) > 1 else None
@@ -259,15 +259,15 @@ def _with_common_verdict(replayed: Replayed, recordings: Recordings, merge: bool
     for name, verification in result.verifications.items():
         objections = recordings.objections(name, parted=len(result.days) >= recordings.number)
         if name == result.selected and merge:
-            notes += [f"merged as asked: {each.sentence}" for each in objections]
+            notes += [f"merged as asked: {objection.sentence}" for objection in objections]
         verifications[name] = verification if merge else verification.with_objections(objections)
     if recordings.unchecked:
         names = ", ".join(recordings.unchecked)
         notes.append(f"{names}: too little to be calibrated alone, so its mounting cannot be compared with the others'")
     found, counts = _without_pauses(replayed.findings, result.counts, len(recordings.pauses_ns))
-    left_out = {str(each) for each in replayed.findings} - {str(each) for each in found}
+    left_out = {str(reason) for reason in replayed.findings} - {str(reason) for reason in found}
     kept = [note for note in replayed.notes if note not in left_out]
-    kept += [str(each) for each in found if str(each) not in kept]
+    kept += [str(reason) for reason in found if str(reason) not in kept]
     return replace(
         replayed,
         result=replace(result, verifications=verifications, counts=counts),
@@ -286,7 +286,7 @@ def _without_pauses(
     remaining = max(dropouts - pauses, 0)
     if remaining == dropouts:
         return findings, counts
-    kept = [each for each in findings if each.code != DROPOUTS]
+    kept = [reason for reason in findings if reason.code != DROPOUTS]
     if remaining:
         kept.append(finding(DROPOUTS, count=remaining))
     return tuple(kept), {**counts, "dvl": {**counts["dvl"], "dropouts": remaining}}
@@ -335,5 +335,5 @@ def calibrated(
     found = extrinsics_of_replay(replayed, name)
     if found is None:
         raise InputError(f"{name}: no sample of it could be used to calibrate; ask dvl-calib doctor")
-    known = {str(each) for each in replayed.findings}
+    known = {str(reason) for reason in replayed.findings}
     return Calibrated(found, [note for note in replayed.notes if note not in known])

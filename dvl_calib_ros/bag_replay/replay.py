@@ -189,8 +189,8 @@ def _model_history(
         sums.insert(0, list(zip(nis_sums.tolist(), used.tolist(), strict=True)))
     return ModelHistory(
         state=np.concatenate(states),
-        std=np.sqrt(np.concatenate([np.diagonal(each, axis1=1, axis2=2) for each in covariances])),
-        misalignment_covariance=np.concatenate([each[:, :3, :3] for each in covariances]),
+        std=np.sqrt(np.concatenate([np.diagonal(covariance, axis1=1, axis2=2) for covariance in covariances])),
+        misalignment_covariance=np.concatenate([covariance[:, :3, :3] for covariance in covariances]),
         nis=_share(np.concatenate(sums)) / MODELS[name].n_measurement,
     )
 
@@ -324,10 +324,10 @@ def replay(
         in_earth=decoder.frame_of_reference is not VelocityFrame.BODY,
         is_level=calibrator.is_level,
     )
-    found += [each.weighed(Severity.WARNING) for each in against]
+    found += [reason.weighed(Severity.WARNING) for reason in against]
     of_drift = objections(navigation, drift_left_open(result.estimate, calibrator.parameters))
     of_all = calibrator.clock_objections(fresh=True) + [
-        each for each in against if each.severity is not Severity.WARNING
+        reason for reason in against if reason.severity is not Severity.WARNING
     ]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
         of_all += [] if result.counts["pairing"]["paired"] else [finding("NOTHING_COMPARED")]
@@ -372,7 +372,7 @@ def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
     estimate, judged = result.estimate, result.verifications.get(result.selected)
     if not estimate.used or result.first_ns is None or result.last_ns is None:
         return None
-    rejected = "" if judged is None else rejection(each.as_dict() for each in judged.reasons)
+    rejected = "" if judged is None else rejection(reason.as_dict() for reason in judged.reasons)
     return extrinsics_of(
         name,
         MODELS[estimate.model],

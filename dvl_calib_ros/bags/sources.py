@@ -49,8 +49,8 @@ def open_bag(path: Path, shown: Path) -> tuple[Counter[Channel], tuple[int, int]
     try:
         with _reader(path) as (reader, channels):
             counts: Counter[Channel] = Counter()
-            for each in reader.connections:
-                counts[channels[each.id]] += each.msgcount
+            for connection in reader.connections:
+                counts[channels[connection.id]] += connection.msgcount
             return counts, (reader.start_time, reader.end_time - 1)
     except DamagedError as error:
         raise InputError(f"{shown}: a ROS 1 bag without a usable index ({error}); run rosbag reindex on it") from error
@@ -59,7 +59,7 @@ def open_bag(path: Path, shown: Path) -> tuple[Counter[Channel], tuple[int, int]
 def bag_batches(path: Path, topics: Collection[str]) -> Iterator[Batch]:
     """Yield the messages of topics of a .bag in ROS 1's layout. Raises DamagedError after the last."""
     with _reader(path) as (reader, channels):
-        wanted = [each for each in reader.connections if each.topic in topics]
+        wanted = [connection for connection in reader.connections if connection.topic in topics]
         if wanted:  # for rosbags an empty list means all
             yield from batched((at, channels[each.id], data) for each, at, data in reader.messages(wanted))
 
@@ -183,7 +183,7 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
         return _in_ros2(Source(shown, *open_bag(path, shown), partial(bag_batches, path)))
     # if the first bytes are lost or were never written, use the name
     kinds = {MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
-    kind = next((kinds[each] for each in kinds if magic.startswith(each)), storage_suffix(shown))
+    kind = next((kinds[kind] for kind in kinds if magic.startswith(kind)), storage_suffix(shown))
     if kind == ".mcap":
         return _open_or_salvage(path, shown, _open_mcap, salvage_mcap, notes)
     if kind == ".db3":

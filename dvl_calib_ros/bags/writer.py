@@ -182,7 +182,7 @@ class BagWriter:
                 whole[key] += part[key]
             whole["message_count"] += part["message_count"]
         files = [each for each in whole["files"] if each["message_count"]]
-        starts = [each["starting_time"]["nanoseconds_since_epoch"] for each in files]
+        starts = [file["starting_time"]["nanoseconds_since_epoch"] for file in files]
         ends = [start + each["duration"]["nanoseconds"] for start, each in zip(starts, files, strict=True)]
         whole["starting_time"] = {"nanoseconds_since_epoch": min(starts)}
         whole["duration"] = {"nanoseconds": max(ends) - min(starts)}

@@ -111,7 +111,7 @@ class Assessor:
             navigation = self._estimates.estimators[name].navigation() if fresh else None
         found = doubts(
             self._estimate(name, fresh=fresh),
-            (self._estimate(each.name, fresh=fresh) for each in self._estimates.arm_finders),
+            (self._estimate(arm_finder.name, fresh=fresh) for arm_finder in self._estimates.arm_finders),
             navigation,
             p,
             suggested=suggested is not None,
@@ -123,7 +123,7 @@ class Assessor:
             return found
         held_out = self.so_far(name, fresh=fresh).reasons
         known_to = drift_left_open(self._estimate(name, fresh=fresh), p)
-        return [*found, *objections(navigation, known_to), *(each for each in held_out if each.code in JUDGED_LIVE)]
+        return [*found, *objections(navigation, known_to), *(error for error in held_out if error.code in JUDGED_LIVE)]
 
     def navigation(self, name: str, deviation: GaussianState | None) -> Navigation | None:
         """Return one model's dead-reckoning drift on held-out data; None without reference or motion.
@@ -146,7 +146,7 @@ class Assessor:
         # one correction per fold and day, by its index in the flat list
         n_days, p = len(terms[0]), self._estimates.parameters
         parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
-        corrections = [each for of_days in terms for each in of_days]
+        corrections = [day for of_days in terms for day in of_days]
         further = self._further
         return dead_reckoned(
             recording, parts, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
@@ -291,17 +291,17 @@ class NonlinearEstimators:
         return iter(self._all)
 
     def _first(self, ask: Callable[[Estimator], _Answer | None]) -> _Answer | None:
-        return next((answer for each in self._all if (answer := ask(each)) is not None), None)
+        return next((answer for estimator in self._all if (answer := ask(estimator)) is not None), None)
 
     @property
     def n_taken(self) -> int:
         """Smallest number of the first aligned row that an estimator has not copied."""
-        return min((each.n_taken for each in self._all), default=NEVER)
+        return min((estimator.n_taken for estimator in self._all), default=NEVER)
 
     @property
     def n_results(self) -> tuple[int, ...]:
         """Counters, by estimator, that grow when it may have new results."""
-        return tuple(each.n_results for each in self._all)
+        return tuple(estimator.n_results for estimator in self._all)
 
     @property
     def affected_from_ns(self) -> int | None:
@@ -311,12 +311,12 @@ class NonlinearEstimators:
     @property
     def reference_claims(self) -> bool:
         """Return whether the reference's noise comes from its messages instead of a parameter."""
-        return any(each.reference_claims for each in self._all)
+        return any(estimator.reference_claims for estimator in self._all)
 
     @property
     def is_level(self) -> bool:
         """Return whether the IMU gives a heading only, so that roll and pitch hold the vehicle's trim."""
-        return any(each.is_level for each in self._all)
+        return any(estimator.is_level for estimator in self._all)
 
     @property
     def arm_effect(self) -> float | None:
@@ -326,12 +326,12 @@ class NonlinearEstimators:
     @property
     def is_horizontal(self) -> bool:
         """Return whether no reference measures the vertical."""
-        return any(each.is_horizontal for each in self._all)
+        return any(estimator.is_horizontal for estimator in self._all)
 
     @property
     def are_clocks_known(self) -> bool:
         """Return whether the data determine the clock offsets, zero or not."""
-        return any(each.registration is not None and each.registration.are_known for each in self._all)
+        return any(estimator.registration is not None and estimator.registration.are_known for estimator in self._all)
 
     @property
     def doubt(self) -> Reason | None:
@@ -375,17 +375,17 @@ class NonlinearEstimators:
     @property
     def n_days(self) -> int:
         """Number of days so far."""
-        return max((each.n_days for each in self._all), default=1)
+        return max((estimator.n_days for estimator in self._all), default=1)
 
     def day_of(self, stamps_ns: Stamps) -> Index:
         """Return the day (N,), from 0, of each stamp (ns), for stamps within `recording`."""
-        days = [each.day_of(stamps_ns) for each in self._all]
+        days = [estimator.day_of(stamps_ns) for estimator in self._all]
         return np.max(days, axis=0) if days else np.zeros(len(stamps_ns), dtype=np.intp)
 
     @contextmanager
     def settled(self) -> Iterator[None]:
         """Let all complete blocks take effect inside this context."""
         with ExitStack() as each_settled:
-            for each in self._all:
-                each_settled.enter_context(each.settled())
+            for estimator in self._all:
+                each_settled.enter_context(estimator.settled())
             yield

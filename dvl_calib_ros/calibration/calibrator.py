@@ -160,8 +160,8 @@ class Calibrator:
         return _KINDS[model.name](setup)
 
     def _before_clearing(self) -> None:
-        for each in self._further:
-            each.advance()
+        for estimator in self._further:
+            estimator.advance()
 
     def _restart(self, back_s: float) -> None:
         """Restart after a clock step, by `back_s` backward (s), negative if forward."""
@@ -203,8 +203,8 @@ class Calibrator:
 
     def feed_fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
         """Take a position (3,) m of the reference point, ENU from any origin, and variances (3,) m², nan if unknown."""
-        for each in self._further:
-            each.take_fix(stamp_ns, position, variance)
+        for estimator in self._further:
+            estimator.take_fix(stamp_ns, position, variance)
 
     def refuse(self, stream: str, reason: str) -> None:
         """Count a message of a stream (dvl, reference, imu) that is no valid sample, under its reason."""
@@ -213,10 +213,10 @@ class Calibrator:
     def _advance(self) -> None:
         """Pass new pairings to the selection, and update the models that have enough samples."""
         aligner = self._aligner
-        for each in self._further:
-            if aligner.partners.n_judged - each.n_taken >= COPIED_AT_ONCE:
-                each.take_rows()
-            each.advance()
+        for estimator in self._further:
+            if aligner.partners.n_judged - estimator.n_taken >= COPIED_AT_ONCE:
+                estimator.take_rows()
+            estimator.advance()
         if aligner.partners.n_paired > self._n_selected:
             self._select()
         due = [group for group in self._groups if self._is_due(group)]
@@ -318,8 +318,8 @@ class Calibrator:
 
     def finish(self) -> None:
         """Update all models with the decided rows, and give all remaining rows to on_rows."""
-        for each in self._further:
-            each.finish()
+        for estimator in self._further:
+            estimator.finish()
         for group in self._groups:
             self._update(group)
         rows = self._aligner.rows
@@ -371,8 +371,8 @@ class Calibrator:
     def selection(self) -> Selection:
         """Model selection over time."""
         if self._worker is None:  # with a worker nothing is gathered, and other threads may read
-            for each in self._further:
-                each.settle()
+            for estimator in self._further:
+                estimator.settle()
             self._select()
         return self._selection
 
@@ -475,8 +475,8 @@ class Calibrator:
         if self._worker is None:
             return {}
         verification = self._judge.so_far(self.selected, fresh=True)
-        known = {each.code for each in verification.reasons}
-        against = [each for each in doubts if each.severity is not Severity.WARNING and each.code not in known]
+        known = {reason.code for reason in verification.reasons}
+        against = [doubt for doubt in doubts if doubt.severity is not Severity.WARNING and doubt.code not in known]
         return {self.selected: verification.with_objections(against)}
 
     @property
@@ -495,7 +495,7 @@ class Calibrator:
     def doubts_so_far(self) -> Sequence[Reason]:
         """`doubts` by the latest evaluation, recomputed (some milliseconds) only when its inputs have changed."""
         clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_results
-        of = (self.selected, *self._further.n_results, *(each.code for each in clocks))
+        of = (self.selected, *self._further.n_results, *(clock.code for clock in clocks))
         if self._doubted is None or self._doubted[0] != of:
             self._doubted = of, self._judge.doubts(self.selected, clocks, fresh=False)
         return self._doubted[1]

@@ -83,7 +83,7 @@ class BagPlayer:
     def unheard(self) -> list[str]:
         """Published topics without a subscriber."""
         publishers = (*self._publishers.values(), *self._description)
-        return [each.topic_name for each in publishers if each.get_subscription_count() < 1]
+        return [publisher.topic_name for publisher in publishers if publisher.get_subscription_count() < 1]
 
     def wait_for_subscribers(self, timeout_s: float = 30.0) -> None:
         """Wait until every publisher has a subscriber. Raises InputError after `timeout_s`."""

@@ -131,7 +131,7 @@ def sign_findings(
         return  # no vehicle that travels ahead
     signs = [each for each in sway_signs if each is not None and each.sign]
     axes, other = (FRD, FLU) if is_turned != parameters.is_z_down else (FLU, FRD)
-    if signs and all(each.sign < 0 for each in signs):
+    if signs and all(sign.sign < 0 for sign in signs):
         yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=other)
         return
     if axes_are_given:

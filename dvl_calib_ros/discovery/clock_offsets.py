@@ -95,7 +95,7 @@ def find_clocks(
     """
     if topics.gnss not in recording.columns or topics.dvl not in recording.columns:
         return None
-    found = [_find_in_recording(each, topics, parameters, knows_mounting, given) for each in recording.each]
+    found = [_find_in_recording(part, topics, parameters, knows_mounting, given) for part in recording.each]
     first = found[0]
     if len(found) > 1 and any(clocks is not None and clocks.offsets.keys() & MOVING for clocks in found):
         return None  # drift or step differ between recordings
@@ -212,7 +212,7 @@ def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStrea
     if imu is not None and imu.has_orientation:
         columns = imu_columns_of(imu)
     measured = True, True, bool(reference.values[:, 2].any())
-    dvl_motion, reference_motion = (in_order(each.stamps_s, each.values) for each in (dvl, reference))
+    dvl_motion, reference_motion = (in_order(look.stamps_s, look.values) for look in (dvl, reference))
     return make_motion(dvl_motion, reference_motion, False, measured, columns)
 
 

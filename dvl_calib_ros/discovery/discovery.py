@@ -83,8 +83,8 @@ class Discovery:
             "topics": topics,
             "found": list(self.found),
             "doubts": list(self.doubts),
-            "contradictions": [each.as_dict() for each in self.contradictions],
-            "notes": [each.as_dict() for each in self.notes],
+            "contradictions": [contradiction.as_dict() for contradiction in self.contradictions],
+            "notes": [note.as_dict() for note in self.notes],
         }
 
 

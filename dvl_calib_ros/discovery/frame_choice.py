@@ -294,15 +294,15 @@ class FrameChooser:
         found = readings.agreements(list(priors), mounting)
         declared_frame = declared_reference(reference, self._parameters, self._base_frame)
         in_earth = declared_frame is not None and declared_frame.frame is not VelocityFrame.BODY
-        if not found or (in_earth and all(each.reading.in_body for each in found)):
+        if not found or (in_earth and all(agreement.reading.in_body for agreement in found)):
             return None  # without an attitude the declaration cannot be tested and is kept
-        candidates = [_Tried(each, mounting, priors[each.reading]) for each in found]
+        candidates = [_Tried(agreement, mounting, priors[agreement.reading]) for agreement in found]
         if mounting is not None:  # or the mounting is wrong, and the DVL's axes are as declared
-            free = readings.agreements([each for each in priors if each.turned == as_declared[each]], None)
+            free = readings.agreements([prior for prior in priors if prior.turned == as_declared[prior]], None)
             candidates += [
-                _Tried(each, None, priors[each.reading] + MOUNTING_OTHER)
-                for each in free
-                if angle_between(each.rotation_dvl_from_body, mounting) > TURNED_FROM
+                _Tried(agreement, None, priors[agreement.reading] + MOUNTING_OTHER)
+                for agreement in free
+                if angle_between(agreement.rotation_dvl_from_body, mounting) > TURNED_FROM
             ]
         first_odds = {
             each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.residual)
@@ -314,14 +314,14 @@ class FrameChooser:
             first_best = ranked[0].agreement
             if first_best.reading.in_body and not readings.is_in_body(first_best):
                 reasons = (finding("BODY_OR_EARTH"),)
-                ranked = [each for each in ranked if not each.reading.in_body] or ranked
+                ranked = [candidate for candidate in ranked if not candidate.reading.in_body] or ranked
         likely = [each for each in ranked if first_odds[each] > first_odds[ranked[0]] - FAR_WORSE][:MOST_REGISTERED]
         most_expected = max(ranked, key=lambda each: each.prior)
         if most_expected not in likely:
             likely.append(most_expected)
         if likely == [most_expected] and most_expected.mounting is mounting:
             return FrameChoice(most_expected.agreement, imus[most_expected.reading], reasons)
-        fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
+        fits = {candidate: readings.registered(candidate.reading, candidate.mounting) for candidate in likely}
         odds = {
             each: each.odds(fit.rotation_dvl_from_body)
             + (_arm_odds(fit) if arm_is_known else 0.0)
@@ -330,16 +330,16 @@ class FrameChooser:
         }
         if math.inf in (fit.residual for fit in fits.values()):  # a failed registration is no evidence
             odds = first_odds
-            rotations = {each: each.agreement.rotation_dvl_from_body for each in fits}
+            rotations = {fit: fit.agreement.rotation_dvl_from_body for fit in fits}
             fits = {each: fit._replace(rotation_dvl_from_body=rotations[each]) for each, fit in fits.items()}
         best, *others = sorted(likely, key=lambda each: -odds[each])
-        equally_likely = [each for each in others if odds[each] > odds[best] - AS_LIKELY]
+        equally_likely = [other for other in others if odds[other] > odds[best] - AS_LIKELY]
         for rival in equally_likely:
             best_options, rival_options = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
             other_axes = any(best_options[name] != rival_options[name] for name in ("dvl_axes", "base_axes"))
             # in which the IMU's frame affects only the lever arm
             in_body = best.reading.in_body and rival.reading.in_body
-            fitted = [fits[each].rotation_dvl_from_body for each in (best, rival)]
+            fitted = [fits[candidate].rotation_dvl_from_body for candidate in (best, rival)]
             if other_axes or (not in_body and angle_between(*fitted) > SAME_ANSWER):
                 reasons += (_ambiguous(best_options, rival_options, fitted),)
                 break

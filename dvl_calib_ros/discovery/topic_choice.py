@@ -120,7 +120,7 @@ def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[Reason]
     if look is None:
         return []
     others = [each for each in survey.looks.values() if is_another_dvl(each, look)]
-    measured = [each for each in others if (difference(look, each) or 0.0) >= SAME_SHARE]
+    measured = [other for other in others if (difference(look, other) or 0.0) >= SAME_SHARE]
     return [
         finding("SECOND_DVL", topic=dvl, frame=look.frame_id, other=each.topic, other_frame=each.frame_id)
         for each in sorted(measured, key=lambda each: each.topic)

@@ -49,15 +49,15 @@ class FrameTree:
         tree = FrameTree()
         for text in descriptions:
             tree._add_urdf(text)
-        for each in transforms:
-            t, q = each.transform.translation, each.transform.rotation
+        for transform in transforms:
+            t, q = transform.transform.translation, transform.transform.rotation
             quaternion = np.array([q.x, q.y, q.z, q.w])
             length = float(np.linalg.norm(quaternion))
             if not 0.5 < length < 2.0 or not np.isfinite([t.x, t.y, t.z]).all():
-                tree.problems.append(finding("TRANSFORM_NOT_ROTATION", frame=each.child_frame_id))
+                tree.problems.append(finding("TRANSFORM_NOT_ROTATION", frame=transform.child_frame_id))
                 continue
             rotation = rotation_from_quaternion(quaternion / length)
-            parent, child = _plain(each.header.frame_id), _plain(each.child_frame_id)
+            parent, child = _plain(transform.header.frame_id), _plain(transform.child_frame_id)
             tree._parents[child] = (parent, rotation, np.array([t.x, t.y, t.z]), "/tf_static")
         return tree
 
@@ -112,10 +112,10 @@ class FrameTree:
             name = self._parents[name][0]
             above.append(name)
         last = _plain(wanted).rsplit("/", 1)[-1]
-        for each in above:
-            if each.rsplit("/", 1)[-1] == last:
-                return each
-        vehicle = [each for each in above if each.rsplit("/", 1)[-1].lower() not in EARTH_NAMES]
+        for link in above:
+            if link.rsplit("/", 1)[-1] == last:
+                return link
+        vehicle = [link for link in above if link.rsplit("/", 1)[-1].lower() not in EARTH_NAMES]
         return vehicle[-1] if vehicle else None
 
     def placed(self, frame_id: str, base_frame: str) -> Placed | None:

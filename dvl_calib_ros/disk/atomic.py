@@ -307,7 +307,7 @@ def _rotate(target: Path, before: Path | None, keep: Keep, is_alone: bool) -> No
     stranded = [] if before is None else [before]
     if is_alone:
         found = target.parent.glob(f"{_stranded_prefix(target)}*{_STRANDED}")
-        stranded += sorted((each for each in found if each != before), key=_modified_ns, reverse=True)
+        stranded += sorted((backup for backup in found if backup != before), key=_modified_ns, reverse=True)
     if not stranded:
         return
     inodes = [each.stat().st_ino for each in [*stranded, target]]
@@ -340,7 +340,7 @@ def _backup_names(target: Path, count: int) -> list[str]:
 def _backups(target: Path) -> list[Path]:
     """Return all backups of a file, newest first."""
     pattern = re.compile(re.escape(target.name) + r"\.bak(\.[1-9]\d{0,3})?")
-    return sorted((each for each in target.parent.iterdir() if pattern.fullmatch(each.name)), key=_number)
+    return sorted((path for path in target.parent.iterdir() if pattern.fullmatch(path.name)), key=_number)
 
 
 def _number(backup: Path) -> int:

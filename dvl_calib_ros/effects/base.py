@@ -211,7 +211,7 @@ class Effect(AnyEffect, ABC):
         for name in ("trace", "late", "turn"):  # these methods expect all parameters
             if act := getattr(self, name, None):
                 vars(found)[name] = lambda of, values, act=act: act(of, {**defaults, **values})
-        vars(found)["parameters"] = tuple(each for each in self.parameters if each.name not in names)
+        vars(found)["parameters"] = tuple(parameter for parameter in self.parameters if parameter.name not in names)
         return found
 
     @property
@@ -341,9 +341,9 @@ class Injection:
 def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn) -> Array:
     """Return the sum (N, 3) m/s, body frame, of the systematic effects of one stage."""
     total = np.zeros_like(motion.velocity_body)
-    for each in injections:
-        if isinstance(each.effect, Effect) and each.effect.acts_on is acts_on:
-            total += each.effect.trace(motion, each.values)
+    for injection in injections:
+        if isinstance(injection.effect, Effect) and injection.effect.acts_on is acts_on:
+            total += injection.effect.trace(motion, injection.values)
     return total
 
 
@@ -355,18 +355,18 @@ def at_dvl(injections: Sequence[Injection], motion: EffectInput) -> EffectInput:
 def turns(injections: Sequence[Injection], motion: EffectInput) -> Array:
     """Return (N, 3) rad, or (3,) for all times, of rotation in addition to φ; motion: of the DVL."""
     total = np.zeros(3)
-    for each in injections:
-        if isinstance(each.effect, MountingEffect):
-            total = total + each.effect.turn(motion, each.values)
+    for injection in injections:
+        if isinstance(injection.effect, MountingEffect):
+            total = total + injection.effect.turn(motion, injection.values)
     return total
 
 
 def late(injections: Sequence[Injection], clock: ActsOn, elapsed: Array) -> Array:
     """Return the delay (N,) s of a clock's stamps for measurements at times (N,) s since the start."""
     total = np.zeros(len(elapsed))
-    for each in injections:
-        if isinstance(each.effect, ClockEffect) and each.effect.acts_on is clock:
-            total += each.effect.late(elapsed, each.values)
+    for injection in injections:
+        if isinstance(injection.effect, ClockEffect) and injection.effect.acts_on is clock:
+            total += injection.effect.late(elapsed, injection.values)
     return total
 
 

@@ -97,21 +97,21 @@ class Examination(Answering):
         if self.judged is Severity.REJECT:
             return "no"
         # the angles that rotate and lift a track
-        needed = [each for each in self.shown if each.name in ("pitch", "yaw")]
-        all_shown = bool(needed) and not any(each.needs for each in needed)
+        needed = [reason for reason in self.shown if reason.name in ("pitch", "yaw")]
+        all_shown = bool(needed) and not any(reason.needs for reason in needed)
         return "yes" if self.judged is Severity.ACCEPT and all_shown else "partly"
 
     @property
     def against(self) -> tuple[Reason, ...]:
         """Reasons of the replay's verdict against its calibration."""
-        return tuple(each for each in self.reasons if each.severity in (Severity.REJECT, Severity.MARGINAL))
+        return tuple(reason for reason in self.reasons if reason.severity in (Severity.REJECT, Severity.MARGINAL))
 
     @property
     def why(self) -> str:
         """Sentence on why it cannot calibrate fully; '' if it can or the findings explain it."""
         if self.verdict == "no" and self.against and is_cause(self.against[0]):
             return self.against[0].full_sentence
-        errors = [each for each in self.findings if each.severity is Severity.ERROR]
+        errors = [reason for reason in self.findings if reason.severity is Severity.ERROR]
         if errors:
             return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
         if not self.has_reference and self.verdict != "no":
@@ -119,7 +119,7 @@ class Examination(Answering):
         if self.cannot or self.verdict == "no":
             why = self.cannot or self.against[0].says
             return full(why)
-        missing = [each.name for each in self.shown if each.needs]
+        missing = [reason.name for reason in self.shown if reason.needs]
         listed = " and ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:])))
         return f"Not shown yet: {listed}." if listed else ""
 
@@ -127,7 +127,7 @@ class Examination(Answering):
         """Return plain data for JSON."""
         return {
             "verdict": self.verdict,
-            "replay": {"verdict": self.judged.value, "reasons": [each.as_dict() for each in self.reasons]},
+            "replay": {"verdict": self.judged.value, "reasons": [reason.as_dict() for reason in self.reasons]},
             "seconds": self.seconds,
             "topics": {
                 content.role.lower(): {
@@ -144,8 +144,8 @@ class Examination(Answering):
             "findings": [found.as_dict() for found in self.findings],
             "speed_mps": self.speed_mps,
             "shown": {
-                each.name: {"std": each.std, "unit": each.unit, "share": each.share, "needs": each.needs}
-                for each in self.shown
+                reason.name: {"std": reason.std, "unit": reason.unit, "share": reason.share, "needs": reason.needs}
+                for reason in self.shown
             },
             "notes": list(self.notes),
         }
@@ -169,10 +169,10 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
     reasons = () if verification is None else tuple(verification.reasons)
     said = set(map(str, reasons))
-    findings = [each for each in findings if str(each.numbers.get("says")) not in said]  # said once
+    findings = [reason for reason in findings if str(reason.numbers.get("says")) not in said]  # said once
     judged = Severity.REJECT if verification is None else verification.verdict
     if judged is not Severity.REJECT:  # the replay is usable, so no finding prevents a calibration
-        findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]
+        findings = [reason.weighed(Severity.WARNING) if _has_error([reason]) else reason for reason in findings]
     return Examination(
         recording.paths,
         seconds["dvl"],
@@ -230,7 +230,7 @@ def judged_replay(
     streams = _streams(recording, discovery)
     look = recording.survey.looks.get(streams["dvl"].topic)
     findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
-    errors = [each for each in findings if _has_error([each])]
+    errors = [reason for reason in findings if _has_error([reason])]
     if not errors or errors[0].code.startswith(NO_IMU):  # that there is no IMU is said before the verdict
         return replayed
     judged = judged.with_objections([errors[0].weighed(Severity.REJECT)])
@@ -335,7 +335,7 @@ def _is_compared_over_legs(reference: Recorded) -> bool:
 
 
 def _has_error(found: Sequence[Reason]) -> bool:
-    return any(each.severity is Severity.ERROR for each in found)
+    return any(reason.severity is Severity.ERROR for reason in found)
 
 
 def _units(dvl: Recorded, reference: Recorded) -> list[Reason]:
@@ -402,7 +402,7 @@ def _one_shown(found: Quantity, estimate: Estimate, parameters: Parameters) -> S
         unit, prior = 100.0, parameters.initial_std_scale
     else:
         unit, prior = math.degrees(1.0), parameters.initial_std_misalignment
-    missing = (each.missing for each in estimate.observability if each.axis == found.name and each.missing)
+    missing = (entry.missing for entry in estimate.observability if entry.axis == found.name and entry.missing)
     needs = "" if found.shown else next(missing, MODELS[estimate.model].shown_by[found.name])
     fine = PredictedDrift.goals(parameters).side / KM
     way = math.log(prior * unit / max(found.std, 1e-12)) / max(math.log(prior / fine), 1e-9)

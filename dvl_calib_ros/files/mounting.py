@@ -195,16 +195,16 @@ def _objections_and_doubts(
 
 def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[str, ...]:
     """Return the warnings of these severities that the node saved with its calibration."""
-    wanted = {each.value for each in severities}
-    return tuple(str(each["says"]) for each in content.get("doubts", ()) if each["severity"] in wanted)
+    wanted = {severity.value for severity in severities}
+    return tuple(str(doubt["says"]) for doubt in content.get("doubts", ()) if doubt["severity"] in wanted)
 
 
 def _unobservable_angles(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
     """Return a sentence with 1 σ for each angle that was not observable."""
-    entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
+    entries = [entry for entry in observability(model, state.p, parameters)[:3] if not entry.observed]
     return tuple(
-        f"{each.name} ({each.axis}) was not observable in the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
-        for each in entries
+        f"{entry.name} ({entry.axis}) was not observable in the data, which leaves ±{math.degrees(entry.std):.1f}° (1σ)"
+        for entry in entries
     )
 
 

@@ -123,7 +123,7 @@ def result_document(
         },
         **({} if verification is None else {"verification": verification_document(verification)}),
         **({"suggestion": result.suggestion.sentence} if result.suggestion else {}),
-        **({"doubts": [each.as_dict() for each in result.doubts]} if result.doubts else {}),
+        **({"doubts": [doubt.as_dict() for doubt in result.doubts]} if result.doubts else {}),
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
         "selected": [{"from_ns": segment.from_ns, "model": segment.model} for segment in result.segments],
         **days_document(result),
@@ -133,7 +133,7 @@ def result_document(
         "std": _std_in_words(estimate, estimate.std),
         "std_of_recording": _std_in_words(estimate, estimate.recording_std),
         "std_by_filter": _std_in_words(estimate, estimate.filter_std),
-        "models": {name: estimate_document(each) for name, each in result.estimates.items()},
+        "models": {name: estimate_document(estimate) for name, estimate in result.estimates.items()},
         _END: True,
     }
 
@@ -160,10 +160,10 @@ def days_document(result: Result) -> dict[str, Any]:
 
 def _found_quantities(result: Result) -> dict[str, str]:
     """Return each quantity with its σ, and which configured values the model does not estimate."""
-    found = {each.name: _in_words(each) for each in quantities(result)}
+    found = {quantity.name: _in_words(quantity) for quantity in quantities(result)}
     configured = {"lever arm": result.parameters["lever_arm"], LATE: [result.parameters["dvl_time_offset"]]}
     for (name, values), unit in zip(configured.items(), ("m", "s"), strict=True):
-        if not any(each.startswith(name) for each in found):
+        if not any(quantity.startswith(name) for quantity in found):
             found[name] = f"{' '.join(f'{value + 0.0:g}' for value in values)} {unit} as configured, not estimated"
     return found
 
@@ -176,7 +176,7 @@ def _in_words(found: Quantity) -> str:
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
     """Return 1 σ of each state with its unit, by the state's name."""
     units = {"phi": (math.degrees(1.0), "deg"), "delta": (100.0, "%")}
-    known = {each.name: (1.0, each.unit) for each in MODELS[estimate.model].nuisance}
+    known = {spec.name: (1.0, spec.unit) for spec in MODELS[estimate.model].nuisance}
     words = {}
     for name, std in zip(estimate.state_names, stds.tolist(), strict=True):
         factor, unit = known.get(name) or units[name.partition("_")[0]]
@@ -309,7 +309,7 @@ def _quality(document: Mapping[str, Any]) -> str:
     """Return the verdict of a result; no observable angle and rejecting warnings take precedence."""
     if document["convergence"] == Convergence.COLLECTING.value:
         return "collecting"
-    if any(each["severity"] == Severity.REJECT.value for each in document.get("doubts", ())):
+    if any(doubt["severity"] == Severity.REJECT.value for doubt in document.get("doubts", ())):
         return Severity.REJECT.value
     return str(document["verification"]["verdict"]) if "verification" in document else "not verified"
 
@@ -329,7 +329,7 @@ class _ResultValue:
 
     @staticmethod
     def of(document: Mapping[str, Any]) -> _ResultValue:
-        rank = [each.value for each in Convergence].index(document["convergence"])
+        rank = [state.value for state in Convergence].index(document["convergence"])
         return _ResultValue(int(document["used"]), rank, document["time_span"]["first_ns"])
 
     @staticmethod

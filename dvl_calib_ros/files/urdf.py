@@ -84,7 +84,7 @@ class Urdf:
 
     def _joint(self, name: str) -> Joint:
         """Return the joint of this name. Raises InputError unless there is exactly one."""
-        found = [each for each in self.joints if each.name == name]
+        found = [joint for joint in self.joints if joint.name == name]
         if len(found) != 1:
             many = "more than one" if found else "no"
             raise InputError(f"{self.path}: {many} joint {name!r}; {self._fixed_joints_text()}")
@@ -92,7 +92,7 @@ class Urdf:
 
     def _joint_above(self, link: str, why: str = "") -> Joint:
         """Return the joint whose child is this link. Raises InputError unless there is exactly one."""
-        found = [each for each in self.joints if _is_link(each.child, link)]
+        found = [joint for joint in self.joints if _is_link(joint.child, link)]
         if len(found) != 1:
             what = f"{'more than one' if found else 'no'} joint above link {link!r}{why}"
             raise InputError(f"{self.path}: {what}; name the DVL's joint with --joint; {self._fixed_joints_text()}")

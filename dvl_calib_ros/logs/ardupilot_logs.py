@@ -171,7 +171,7 @@ def _in_order(rows: list[tuple[int, list[float]]]) -> list[tuple[int, list[float
 
 
 def _tuple(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(each) + 0.0 for each in values)
+    x, y, z = (float(value) + 0.0 for value in values)
     return x, y, z
 
 

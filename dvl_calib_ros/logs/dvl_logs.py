@@ -172,11 +172,11 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
     nmea = Nmea()
     waters: list[WaterReading] = []
     alignments: Counter[float] = Counter()
-    for each in _ensembles(content):
-        data = dict(each)
+    for ensemble in _ensembles(content):
+        data = dict(ensemble)
         try:
             stamp_ns = _pd0_stamp(data)
-            for identity, message in each:
+            for identity, message in ensemble:
                 if identity == GENERAL_NMEA:
                     nmea.take(stamp_ns, message)
             sample = _pd0_sample(path, stamp_ns, data, left_out)

@@ -103,6 +103,6 @@ def _sample(data: bytes) -> DvlSample | None:
     weights = valid[2:] / valid[2:].sum()
     vertical = float(np.where(valid[2:], velocity[2:], 0.0) @ weights)
     stds = [*noise[:2].tolist(), float(np.where(valid[2:], noise[2:], 0.0) @ weights)]
-    covariance = np.diag(np.square(stds)) if all(math.isfinite(each) and each > 0.0 for each in stds) else None
+    covariance = np.diag(np.square(stds)) if all(math.isfinite(std) and std > 0.0 for std in stds) else None
     x, y, z = (FLU_FROM_FRD @ [velocity[0], velocity[1], vertical] + 0.0).tolist()
     return DvlSample(stamp_ns, (x, y, z), covariance)

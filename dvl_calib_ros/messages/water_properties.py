@@ -109,7 +109,7 @@ def water_of(readings: Sequence[OfWater], dvl: str) -> Water | None:
     pressure = _middle(by_kind.get("pressure", []))
     if not math.isnan(pressure):
         known["depth"] = max(0.0, (pressure - _SURFACE_PA) / _PA_PER_M)
-    own = [each for each in by_kind.get("used", []) if each.topic == dvl] or by_kind.get("used", [])
+    own = [reading for reading in by_kind.get("used", []) if reading.topic == dvl] or by_kind.get("used", [])
     used = _middle(own)
     if _SPEEDS[0] <= used <= _SPEEDS[1] and np.ptp(own[0].values) <= _STEADY * used:
         known["used"] = used
@@ -123,13 +123,13 @@ def _middle(readings: Sequence[OfWater]) -> float:
 
 def _in_water(readings: Sequence[OfWater]) -> OfWater | None:
     """Return the readings of the thermometer in the water; None if it is unclear which that is."""
-    words = [set(re.split("[^a-z]+", each.topic.lower())) for each in readings]
+    words = [set(re.split("[^a-z]+", reading.topic.lower())) for reading in readings]
     maybe = [(each, own) for each, own in zip(readings, words, strict=True) if not own & _NOT_IN_WATER]
     named = [each for each, own in maybe if own & _IN_WATER]
     chosen = named or [each for each, _ in maybe]
     if not chosen or (len(chosen) > 1 and not named):
         return None
-    middles = [float(np.median(each.values)) for each in chosen]
+    middles = [float(np.median(reading.values)) for reading in chosen]
     if max(middles) - min(middles) > _AGREE or not TEMPERATURES[0] <= middles[0] <= TEMPERATURES[1]:
         return None
     return chosen[0]

@@ -425,7 +425,7 @@ class CalibrationNode(AnsweringNode):
             return
         # A subscriber would use the mounting of a wrong configuration. Waiting messages are not examined, so check
         # every time.
-        if calibrator.suggestion_so_far or any(each.severity is Severity.REJECT for each in calibrator.doubts_so_far):
+        if calibrator.suggestion_so_far or any(doubt.severity is Severity.REJECT for doubt in calibrator.doubts_so_far):
             return
         self._mounting_published = state_of
         stamp = Time()

@@ -176,14 +176,14 @@ def diagnose(
     if suggestion := calibrator.suggestion_so_far:
         found.append(finding("CONFIGURATION_WRONG", says=suggestion))
     doubts = calibrator.doubts_so_far
-    rejected = bool(suggestion) or any(each.severity is Severity.REJECT for each in doubts)
+    rejected = bool(suggestion) or any(doubt.severity is Severity.REJECT for doubt in doubts)
     verdict = Severity.REJECT if rejected else calibrator.verdict_so_far
     # a reason to reject in a replay is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
     if verdict is Severity.ACCEPT:
         found = of_consequence(found, calibrator.parameters.target_drift)
-    if any(each.code == "REFERENCE_FRAME" for each in problems):  # the receiver works: its messages are refused
-        found = [each for each in found if not each.code.startswith("GNSS_OUTAGE")]
+    if any(problem.code == "REFERENCE_FRAME" for problem in problems):  # the receiver works: its messages are refused
+        found = [doubt for doubt in found if not doubt.code.startswith("GNSS_OUTAGE")]
     found.sort(key=lambda each: (each.severity is not Severity.ERROR, each.code not in _CAUSES))
     status = DiagnosticStatus(level=_status_level(found), hardware_id="dvl")
     status.message = printable("; ".join(map(str, found))) or f"{estimate.model} {estimate.convergence.value}"
@@ -224,7 +224,7 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     values = {}
     model, std = MODELS[estimate.model], estimate.std
     by_filter = dict(zip(estimate.state_names, estimate.filter_std.tolist(), strict=True))
-    units = {each.name: each.unit for each in model.nuisance}
+    units = {spec.name: spec.unit for spec in model.nuisance}
     for entry in estimate.observability:
         name = entry.name
         index = estimate.state_names.index(name)

@@ -52,10 +52,10 @@ class Transforms:
 
     def _on_transforms(self, message: Any) -> None:
         """Keep the newest transform of each child frame, except this node's own."""
-        others = [each for each in message.transforms if each not in self._own]
-        for each in others:
+        others = [transform for transform in message.transforms if transform not in self._own]
+        for other in others:
             if len(self._transforms) < MOST_TRANSFORMS:
-                self._transforms[each.child_frame_id] = each
+                self._transforms[other.child_frame_id] = other
         self.n_messages += bool(others)
 
     def own(self, transform: Any) -> None:

@@ -58,7 +58,7 @@ class WaterHeard:
         topic, kind, message = dvl
         if message is not None and readers(topic, kind):
             self._collector(topic, kind).add(message)
-        return water_of([each for one in self._collectors.values() for each in one.readings()], topic)
+        return water_of([reading for one in self._collectors.values() for reading in one.readings()], topic)
 
     def _collector(self, topic: str, kind: str) -> WaterCollector:
         return self._collectors.setdefault((topic, kind), WaterCollector(topic, kind, READINGS))

@@ -210,7 +210,7 @@ class TopicColumns:
     def part(self, kept: Mask) -> TopicColumns:
         """Return the messages of a mask (N,), in the order of `arrivals`."""
         arrival = self.arrivals[0][kept]
-        laid, singles = (np.flatnonzero(np.isin(each.arrival, arrival)) for each in (self.laid, self.singles))
+        laid, singles = (np.flatnonzero(np.isin(part.arrival, arrival)) for part in (self.laid, self.singles))
         return replace(self, laid=self.laid.part(laid), singles=self.singles.part(singles))
 
     def arriving(self, renumbered: Callable[[Stamps], Stamps]) -> TopicColumns:
@@ -296,7 +296,7 @@ class Collector:
     def _take_singly(self, part: Part) -> None:
         """Keep the bytes of messages that have no common layout."""
         data = list(part.data())
-        end = self._bytes + np.cumsum([len(each) for each in data], dtype=np.int64)
+        end = self._bytes + np.cumsum([len(message) for message in data], dtype=np.int64)
         self._bytes = int(end[-1])
         channel = np.full(len(data), self._channels.setdefault(part.channel, len(self._channels)))
         content = np.frombuffer(b"".join(data), dtype=np.uint8)

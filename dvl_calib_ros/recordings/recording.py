@@ -318,7 +318,7 @@ def _read(
         notes=(*bag.notes, *map(str, far_findings)),
         columns={topic: (column,) for topic, column in kept.items()},
         transforms=tuple(found.transforms), descriptions=tuple(dict.fromkeys(found.descriptions)),
-        waters=tuple(reading for each in found.waters.values() for reading in each.readings()),
+        waters=tuple(reading for water in found.waters.values() for reading in water.readings()),
         field_maps=_field_maps(bag),
     )  # fmt: skip
 

@@ -61,7 +61,7 @@ def stretches(
     for index in range(len(ends)):
         if (len(ends) - 1 - index) * WINDOWS % len(ends) >= share * len(ends):
             continue
-        log_ns = max(each.newest_ns(index) for parts in cuts.values() for each in parts)
+        log_ns = max(part.newest_ns(index) for parts in cuts.values() for part in parts)
         dvl, reference, imu = (
             _block(
                 stream,

@@ -87,8 +87,8 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     is_imu = msgtype == IMU_TYPE
     width = 4 if is_imu else 3
     columns = [
-        (each.arrival, each.log_ns, each.stamps_ns, each.values[:, :width], *(NOTHING if is_imu else _claimed(each)))
-        for each in (part.laid for part in parts)
+        (laid.arrival, laid.log_ns, laid.stamps_ns, laid.values[:, :width], *(NOTHING if is_imu else _claimed(laid)))
+        for laid in (part.laid for part in parts)
     ]
     if rows or len(columns) > 1:
         columns.append(_of_rows(rows, width, is_imu))
@@ -107,9 +107,9 @@ def _claimed(laid: Laid) -> tuple[Array, Codes]:
 
 def _in_order(columns: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
     """Join rows and sort them by arrival, the first column."""
-    joined = [np.concatenate(each) for each in zip(*columns, strict=True)]
+    joined = [np.concatenate(column_parts) for column_parts in zip(*columns, strict=True)]
     order = np.argsort(joined[0], kind="stable")
-    return tuple(each[order] if len(each) == len(order) else each for each in joined)
+    return tuple(column[order] if len(column) == len(order) else column for column in joined)
 
 
 def _plausible(values: Array, most: float) -> Array:

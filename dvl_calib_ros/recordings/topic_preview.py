@@ -154,7 +154,7 @@ def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
     """
     if len(stamps_ns) < 2:
         return 1.0
-    stamped, logged = (float(median(np.diff(np.sort(each)).astype(float))) for each in (stamps_ns, log_ns))
+    stamped, logged = (float(median(np.diff(np.sort(times_ns)).astype(float))) for times_ns in (stamps_ns, log_ns))
     rates = (stamped / logged, float(np.ptp(stamps_ns) / np.ptp(log_ns))) if stamped > 0.0 and logged > 0.0 else (1.0,)
     return rates[-1] if min(abs(math.log(rate)) for rate in rates) > SIMULATED_TIME else 1.0
 
@@ -173,7 +173,7 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
     spans_ns: start and end of each recorded stretch, in order.
     """
     arrivals = [part.arrivals for part in parts]
-    arrival, log_ns = (np.concatenate(each) for each in zip(*arrivals, strict=True))
+    arrival, log_ns = (np.concatenate(column) for column in zip(*arrivals, strict=True))
     if len(parts) > 1:
         order = np.argsort(arrival, kind="stable")
         arrival, log_ns = arrival[order], log_ns[order]
@@ -287,13 +287,13 @@ class _Numbers:
         """Return stamps, log times, values, additional values, and the indices of valid rows in order of stamps."""
         if not self._rows:
             return None
-        arrival, log_ns, stamps_ns, values, extra = (np.concatenate(each) for each in zip(*self._rows, strict=True))
+        arrival, log_ns, stamps_ns, values, extra = (np.concatenate(column) for column in zip(*self._rows, strict=True))
         whole = np.ones(len(values), dtype=bool)
         if self._msgtype != IMU_TYPE:
             values[(values == 0.0).all(axis=1)] = np.nan  # sent by drivers without a measurement
             whole = (np.abs(values) < FASTEST).all(axis=1)
-        for each in (values, extra[:, :3]):
-            each[~(np.abs(each) < FASTEST)] = np.nan  # so that squares are finite
+        for numbers in (values, extra[:, :3]):
+            numbers[~(np.abs(numbers) < FASTEST)] = np.nan  # so that squares are finite
         order = np.lexsort((arrival, stamps_ns))
         return stamps_ns, log_ns, values, extra, order[whole[order]]
 

@@ -67,7 +67,7 @@ class Follower:
             for make, rate, seed in zip(makers, rates, (seeds.dvl, seeds.gnss, seeds.imu), strict=True)
             if rate
         ]
-        constants = (each.values.get("time_constant_s", 0.0) for each in scenario.effects)
+        constants = (effect.values.get("time_constant_s", 0.0) for effect in scenario.effects)
         self._memory_s = REMEMBERED_CONSTANTS * max(constants, default=0.0)
         self._window: deque[MotionSample] = deque()
         self._pending: list[tuple[int, int, Sample]] = []
@@ -102,10 +102,10 @@ class Follower:
             return
         window = list(self._window)
         motion = Motion(
-            np.array([each.time for each in window]),
-            np.array([each.velocity_body for each in window]),
-            np.array([each.rotation_enu_from_body for each in window]),
-            np.array([each.angular_velocity for each in window]),
+            np.array([sample.time for sample in window]),
+            np.array([sample.velocity_body for sample in window]),
+            np.array([sample.rotation_enu_from_body for sample in window]),
+            np.array([sample.angular_velocity for sample in window]),
         )
         world = world_of(self._scenario, motion, self._disturbed)
         for sensor, at in due:

@@ -179,7 +179,7 @@ def truth_document(scenario: Scenario) -> dict[str, Any]:
     return document | {
         "phi_rad": phi.tolist(),
         "delta_k": delta_k.tolist(),
-        "effects": [injection_document(each) for each in scenario.effects],
+        "effects": [injection_document(effect) for effect in scenario.effects],
         "version": __version__,
     }
 

@@ -136,7 +136,7 @@ def _finite(word: str) -> float:
 def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
     """Describe the DVL by the calibration and effects of a diagnosis."""
     dvl, sizes = document["dvl"], {name: float(size) for name, size in document["dvl"]["sizes_mps"].items()}
-    found = {each["name"]: _values(each["parameters"]) for each in document["effects"]}
+    found = {effect["name"]: _values(effect["parameters"]) for effect in document["effects"]}
     arm = found.get("lever_arm", {})
     bias = found.get("velocity_bias", {})
     phi, scale = (_values(document["calibration"][name]) for name in ("phi_rad", "delta_k"))
@@ -155,7 +155,7 @@ def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
         speed=_three(dvl["speed_mps"]),
         others=_others(document, found, sizes),
         ambiguous=tuple(
-            (each["name"], *each["equivalent_to"]) for each in document["effects"] if each.get("equivalent_to")
+            (effect["name"], *effect["equivalent_to"]) for effect in document["effects"] if effect.get("equivalent_to")
         ),
     )
 
@@ -180,10 +180,10 @@ def _others(
     ]
     if document.get("verdict") == "unknown":
         others.append(Other(NOT_EXPLAINED, {}, float(document["gap"]["not_explained_mps"])))
-    noise = [Other(each["name"], _values(each["parameters"])) for each in document.get("noise", [])]
+    noise = [Other(entry["name"], _values(entry["parameters"])) for entry in document.get("noise", [])]
     return (
         *others,
-        *(Other(each.name, each.parameters, sizes.get(each.name), _is_of_reference(each.name)) for each in noise),
+        *(Other(entry.name, entry.parameters, sizes.get(entry.name), _is_of_reference(entry.name)) for entry in noise),
     )
 
 

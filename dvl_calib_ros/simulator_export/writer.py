@@ -80,7 +80,7 @@ def export_document(export: Export, description: DvlDescription, version: str) -
     return {
         "simulator": export.simulator,
         "source": description.source,
-        "missing": [{"name": each.name, "says": each.says, "error_mps": each.error} for each in export.missing],
+        "missing": [{"name": effect.name, "says": effect.says, "error_mps": effect.error} for effect in export.missing],
         "found": dict(export.settings.found),
         "defaults": dict(export.settings.defaults),
         "remarks": list(export.remarks),
@@ -185,7 +185,7 @@ def equal_std(noise_std: tuple[float, float, float]) -> float:
 def tidy(value: Any) -> Any:
     """Round numbers to nine digits, more than any is known to, and remove -0.0."""
     if isinstance(value, list | tuple):
-        return [tidy(each) for each in value]
+        return [tidy(item) for item in value]
     return float(f"{value:.9g}") + 0.0 if isinstance(value, float) else value
 
 

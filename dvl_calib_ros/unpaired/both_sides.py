@@ -144,10 +144,10 @@ def read_log(
 ) -> Log:
     """Read and diagnose one side. Raises InputError if it cannot be compared."""
     loaded = load_recordings(source.opened, source.parameters, source.topics)
-    facts = tuple(stream_facts(each, source.parameters, source.topics) for each in source.opened.each)
+    facts = tuple(stream_facts(part, source.parameters, source.topics) for part in source.opened.each)
     on_progress(0.5)
-    exact = all(float(np.linalg.norm(each.dvl.roughness)) < NOISE_FREE_MPS for each in loaded.recordings)
-    recordings = tuple(dithered(each) for each in loaded.recordings) if exact else loaded.recordings
+    exact = all(float(np.linalg.norm(recording.dvl.roughness)) < NOISE_FREE_MPS for recording in loaded.recordings)
+    recordings = tuple(dithered(recording) for recording in loaded.recordings) if exact else loaded.recordings
     diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, with_series=with_series)
     on_progress(1.0)
     residuals: tuple[Array, ...] = ()

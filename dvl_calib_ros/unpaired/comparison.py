@@ -89,7 +89,7 @@ def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
         found += _growth(slopes)
         found += [_tails(scaled[0], scaled[1])]
     found.append(_colour(vehicle, simulator))
-    return [each for each in found if each is not None]
+    return [candidate for candidate in found if candidate is not None]
 
 
 def scatter(log: Log) -> list[Scatter]:
@@ -142,13 +142,13 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     blocks = [block_levels(side, axis) for side in (vehicle, simulator)]
     if min(map(len, blocks)) < FEWEST_BLOCKS:
         return None
-    of_reference = [max(each.of_reference for each in side) for side in (vehicle, simulator)]
+    of_reference = [max(recorded.of_reference for recorded in side) for side in (vehicle, simulator)]
     intervals = []
     for levels, reference in zip(blocks, of_reference, strict=True):
         value, low, high = np.exp(mean_of(levels))
         intervals.append((float(value), float(np.sqrt(max(low**2 - reference**2, 0.0))), float(high)))
     larger = 0 if intervals[0][0] >= intervals[1][0] else 1
-    own_levels = [np.asarray(each) for each in blocks]
+    own_levels = [np.asarray(block) for block in blocks]
     if of_reference[larger] > 0.0:
         own_variance = np.exp(2.0 * own_levels[larger]) - of_reference[larger] ** 2
         own_levels[larger] = 0.5 * np.log(np.maximum(own_variance, 1e-12))
@@ -165,7 +165,7 @@ def levels_by_regime(log: Log) -> dict[str, float]:
     noise_samples = scatter(log)
     if not noise_samples or log.selection is None:
         return {}
-    values = np.concatenate([each.values for each in noise_samples])
+    values = np.concatenate([noise_sample.values for noise_sample in noise_samples])
     masks = {"all": np.ones(len(values), dtype=bool)}
     has_motion: Any = noise_samples  # per sample, `regimes` reads nothing but the motion
     masks |= regimes(log.selection.fitter.problem, has_motion, per_sample=True)
@@ -184,10 +184,10 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
     units = {"speed": "1/(m/s)", "turn_rate": "1/(rad/s)", "astern": "1/(m/s)"}
     found: list[Candidate | None] = []
     for name, unit in units.items():
-        if not all(name in each for each in slopes):
+        if not all(name in slope for slope in slopes):
             continue
-        (vehicle_slope, vehicle_std), (simulator_slope, simulator_std) = (each[name] for each in slopes)
-        is_present = tuple(_is_significant(each, name) for each in slopes)
+        (vehicle_slope, vehicle_std), (simulator_slope, simulator_std) = (slope[name] for slope in slopes)
+        is_present = tuple(_is_significant(slope, name) for slope in slopes)
         p = float(2.0 * norm.sf(abs(vehicle_slope - simulator_slope) / np.hypot(vehicle_std, simulator_std)))
         found.append(
             Candidate(
@@ -211,13 +211,13 @@ def _is_significant(slopes: Slopes, name: str) -> bool:
 
 def at_one_motion(sides: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
     """Scale the noise to a common motion of both sides, by the significant growth."""
-    columns = [[_covariates(each) for each in side] for side in sides]
+    columns = [[_covariates(recorded) for recorded in side] for side in sides]
     names = [name for name in SPREAD if any(name in slope and _is_significant(slope, name) for slope in slopes)]
     scaled = [list(side) for side in sides]
     for name in names:
-        if not all(name in each for side in columns for each in side):
+        if not all(name in recorded for side in columns for recorded in side):
             continue
-        mean = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
+        mean = float(np.mean([np.mean(np.concatenate([recorded[name] for recorded in side])) for side in columns]))
         for side, slope, own_columns in zip(scaled, slopes, columns, strict=True):
             if name in slope and _is_significant(slope, name):
                 for index, each in enumerate(side):
@@ -265,8 +265,8 @@ def _tails(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> Candidat
     counts = []
     for side in (vehicle, simulator):
         far = n = 0
-        for each in side:
-            size = np.abs(each.values[:: each.thin]) / robust_std(each.values)
+        for recorded in side:
+            size = np.abs(recorded.values[:: recorded.thin]) / robust_std(recorded.values)
             far += int(((size > TAIL) & (size < OUTLIER)).sum())
             n += size.size
         counts.append((far, n))
@@ -280,11 +280,11 @@ def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
     these means and differ between the sides.
     """
     findings = [_finding(log, "coloured_reference_noise") for log in (vehicle, simulator)]
-    findings = [each if each is not None and each.p < GROWS else None for each in findings]
+    findings = [colour if colour is not None and colour.p < GROWS else None for colour in findings]
     if findings[0] is None and findings[1] is None:
         return None
     slow = [_block_means(log) for log in (vehicle, simulator)]
-    if min(len(each) for each in slow) < 3 * FEWEST_BLOCKS:
+    if min(len(means) for means in slow) < 3 * FEWEST_BLOCKS:
         return None
     ratio = float(np.mean(slow[0] ** 2) / np.mean(slow[1] ** 2))
     above = float(f_distribution.sf(ratio, len(slow[0]), len(slow[1])))
@@ -297,7 +297,7 @@ def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _finding(log: Log, name: str) -> NoiseFinding | None:
-    return next((each for each in log.diagnosis.noise if each.name == name), None)
+    return next((entry for entry in log.diagnosis.noise if entry.name == name), None)
 
 
 def _block_means(log: Log) -> Array:
@@ -353,13 +353,13 @@ def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
     candidates = [*compare_noise(vehicle, simulator), *compare_streams(vehicle, simulator)]
     names = common_names(vehicle, simulator)
     compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names))
-    p = holm([*compared.p.values(), *(each.p for each in candidates)])
+    p = holm([*compared.p.values(), *(candidate.p for candidate in candidates)])
     found = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
     found += [compared.untested(name) for name in compared.names if name not in compared.p]
     found.sort(key=lambda each: (ORDER.index(each.status), -each.adds_mps))
     noise = [_noise(each, float(adjusted)) for each, adjusted in zip(candidates, p[len(compared.p) :], strict=True)]
     noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
-    status = {each.name: each.status for each in found}
+    status = {candidate.name: candidate.status for candidate in found}
     compared_sizes = {name: (*compared.sizes[name], status[name]) for name in compared.p}
     own_effects = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
     shrunk = shrink(vehicle, simulator, models(compared_sizes, own_effects))
@@ -391,7 +391,7 @@ def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
         "shrunk": shrunk,
         "residuals": {"vehicle": vehicle.residuals, "simulator": simulator.residuals},
         "intervals": {
-            side: [each.dvl.interval for each in log.recordings]
+            side: [recording.dvl.interval for recording in log.recordings]
             for side, log in (("vehicle", vehicle), ("simulator", simulator))
         },
     }
@@ -462,9 +462,9 @@ class _Compared:
         """Return the effects that either diagnosis cannot distinguish from this one."""
         others: list[str] = []
         for log, renamed in zip(self._logs, self._renamed, strict=True):
-            for each in log.diagnosis.effects:
-                if renamed[each.name] == name:
-                    others += [n for n in (each.name, *each.equivalent_to) if n != name]
+            for effect in log.diagnosis.effects:
+                if renamed[effect.name] == name:
+                    others += [n for n in (effect.name, *effect.equivalent_to) if n != name]
         return tuple(dict.fromkeys(others))
 
 
@@ -494,7 +494,7 @@ def _noise(candidate: Candidate, p: float) -> ComparedNoise:
 def _unobserved(diagnosis: Diagnosis) -> dict[str, str]:
     """Return effects unobservable on a side at relevant sizes -> the smallest detectable size, or the missing data."""
     found = {name: f"needs {needs}" for name, needs in diagnosis.untestable.items()}
-    named = {each.name for each in diagnosis.effects}
+    named = {effect.name for effect in diagnosis.effects}
     for name, least in diagnosis.minimum_detectable.items():
         typical = {spec.name: spec.typical for spec in EFFECTS[name].parameters}
         if name not in named and not any(size <= VISIBLE_TIMES_TYPICAL * typical[key] for key, size in least.items()):
@@ -506,12 +506,12 @@ def _verdict(
     effects: Sequence[ComparedEffect], noise: Sequence[ComparedNoise], vehicle: Diagnosis, simulator: Diagnosis
 ) -> SimulatorVerdict:
     """Return the verdict: effects weigh more than noise, and a difference more than missing excitation."""
-    if any(each.status.is_claim for each in effects):
+    if any(effect.status.is_claim for effect in effects):
         return SimulatorVerdict.DIFFERENT
-    if any(each.status.is_claim for each in noise):
+    if any(entry.status.is_claim for entry in noise):
         return SimulatorVerdict.ONLY_NOISE
     unsure = Explained.INSUFFICIENT_EXCITATION in (vehicle.verdict, simulator.verdict)
-    if unsure or any(each.status is ComparisonStatus.CANNOT_TELL for each in effects):
+    if unsure or any(effect.status is ComparisonStatus.CANNOT_TELL for effect in effects):
         return SimulatorVerdict.CANNOT_TELL
     return SimulatorVerdict.NO_DIFFERENCE
 
@@ -534,7 +534,7 @@ def _reasons(
     """Return the verdict's reasons, and the unexplained remainder."""
     reasons = []
     for status, code in CLAIMED.items():
-        named = [" or ".join((each.name, *each.equivalent_to)) for each in effects if each.status is status]
+        named = [" or ".join((effect.name, *effect.equivalent_to)) for effect in effects if effect.status is status]
         if named:
             reasons.append(finding(code, names=" and ".join(named)))
     if reasons:
@@ -543,7 +543,7 @@ def _reasons(
     else:
         is_open = verdict is SimulatorVerdict.CANNOT_TELL
         reasons.append(finding("SIMULATOR_NOT_SHOWN" if is_open else "SIMULATOR_ALIKE"))
-    if differing := [each.name for each in noise if each.status.is_claim]:
+    if differing := [entry.name for entry in noise if entry.status.is_claim]:
         reasons.append(finding("SIMULATOR_NOISE", names=", ".join(differing)))
     unknown = [side for side, d in (("vehicle", vehicle), ("simulator", simulator)) if d.verdict is Explained.UNKNOWN]
     if unknown:

@@ -140,7 +140,7 @@ def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str
 
     An effect that one side cannot distinguish from one found on the other side gets that name.
     """
-    equals = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
+    equals = [{effect.name: effect.equivalent_to for effect in log.diagnosis.effects} for log in (vehicle, simulator)]
     names: list[dict[str, str]] = [{name: name for name in side} for side in equals]
     for own, other_side in ((0, 1), (1, 0)):
         for name, equivalent in equals[own].items():

@@ -113,8 +113,8 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel]) -> Sh
         raise ValueError("nothing was fitted to the vehicle's recordings")
     rng = np.random.default_rng(0)
     problem = selection.fitter.problem
-    recorded = [each.dvl.values for each in problem.recordings]
-    time = np.concatenate([each.dvl.time for each in problem.recordings])
+    recorded = [recording.dvl.values for recording in problem.recordings]
+    time = np.concatenate([recording.dvl.time for recording in problem.recordings])
     recording_of = np.repeat(np.arange(len(recorded), dtype=np.intp), [len(each) for each in recorded])
     windows: Array = np.floor(time / WINDOW_S) + 1e6 * recording_of
     full = _held_out(selection, ladder[-1])
@@ -172,7 +172,7 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     fixed = frozenset(kept)
     bins = stretch_of(problem.time) % SETTINGS.folds
     sample_folds = [_fold_of(problem, index) for index in range(n)]
-    predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
+    predicted = [np.full_like(recording.dvl.values, np.nan) for recording in problem.recordings]
     # at shifted times the reference's noise is different, so it would count twice
     denoised = with_denoised_reference(problem)
     for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
@@ -207,7 +207,7 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
         for _ in range(SIMULATED)
     ]
     return [
-        np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(denoised, hypothesis, index)
+        np.stack([simulated(entry, hypothesis, index) for entry in noisy]) - simulated(denoised, hypothesis, index)
         for index in range(len(problem.recordings))
     ]
 

@@ -145,7 +145,7 @@ class UnpairedComparison(Answering):
     @property
     def missing(self) -> tuple[ComparedEffect, ...]:
         """Return the vehicle's effects that the simulator lacks, the largest first."""
-        return tuple(each for each in self.effects if each.status is ComparisonStatus.MISSING)
+        return tuple(effect for effect in self.effects if effect.status is ComparisonStatus.MISSING)
 
 
 def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
@@ -154,13 +154,13 @@ def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
         "verdict": comparison.verdict.value,
         "sentence": comparison.sentence,
         "reasons": [reason.as_dict() for reason in comparison.reasons],
-        "effects": [_row(each, p="p_adjusted", lies="where") for each in comparison.effects],
-        "noise": [_row(each, p="p_adjusted") for each in comparison.noise],
+        "effects": [_row(effect, p="p_adjusted", lies="where") for effect in comparison.effects],
+        "noise": [_row(entry, p="p_adjusted") for entry in comparison.noise],
         "noise_level_mps": {
             regime: {"vehicle": vehicle, "simulator": simulator}
             for regime, (vehicle, simulator) in comparison.levels.items()
         },
-        "shrinks": [_row(each, name="model", distance="energy_distance") for each in comparison.rungs],
+        "shrinks": [_row(rung, name="model", distance="energy_distance") for rung in comparison.rungs],
         "noise_floor_mps": comparison.floor_mps,
         "not_shown": {side: dict(names) for side, names in comparison.not_shown.items()},
         "notes": list(comparison.notes),

@@ -47,7 +47,7 @@ def mean_of(values: Array) -> Array:
 
 def welch(one: Array, other: Array) -> float:
     """Return the p-value of equal means of two samples with any scatter."""
-    a, b = (float(each.var(ddof=1)) / len(each) for each in (one, other))
+    a, b = (float(values.var(ddof=1)) / len(values) for values in (one, other))
     if a + b <= 0.0:
         return 1.0 if one.mean() == other.mean() else 0.0
     dof = (a + b) ** 2 / (a**2 / (len(one) - 1) + b**2 / (len(other) - 1))
@@ -81,7 +81,7 @@ def compare_streams(vehicle: Log, simulator: Log) -> list[Candidate]:
     """Compare all properties observable on both sides."""
     functions = (_exact, _outliers, _dropouts, _zeros, _repeats, _rate, _jitter, _latency)
     found = [function(vehicle, simulator) for function in functions]
-    return [each for each in found if each is not None]
+    return [candidate for candidate in found if candidate is not None]
 
 
 def _outliers(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -188,8 +188,8 @@ def _compare_times(name: str, vehicle: Array, simulator: Array, threshold_s: flo
     """Compare the means of block values (B,) s of both sides; differences below a threshold do not matter."""
     if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
         return None
-    means: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
-    is_present = tuple(abs(float(each.mean())) > threshold_s for each in (vehicle, simulator))
+    means: list[Triple] = [tuple(mean_of(values).tolist()) for values in (vehicle, simulator)]  # type: ignore[misc]
+    is_present = tuple(abs(float(values.mean())) > threshold_s for values in (vehicle, simulator))
     gap = abs(float(vehicle.mean() - simulator.mean()))
     return Candidate(
         name,

@@ -78,7 +78,7 @@ class Tables:
         self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
         self.eras: set[int] = set()
         self.lengths: dict[int, int] = {}
-        self._met = {(SCHEMA, each) for each in self.schemas} | {(CHANNEL, each) for each in self.channels}
+        self._met = {(SCHEMA, schema) for schema in self.schemas} | {(CHANNEL, channel) for channel in self.channels}
         self._made: dict[int, tuple[str, str, str, str]] = {}
         if summary and summary.statistics and summary.statistics.message_count:
             self.note_era(summary.statistics.message_start_time)

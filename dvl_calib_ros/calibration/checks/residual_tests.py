@@ -151,9 +151,9 @@ def residual_trend(
     if fast is None or means is None:
         return None
     tilt, tilt_std = fast.fit.x[-3:-1], fast.fit.std[-3:-1]
-    tilt_std[[each.std() < LEAST_TILT for each in changing_tilt]] = math.inf
+    tilt_std[[axis.std() < LEAST_TILT for axis in changing_tilt]] = math.inf
     # without tilt data, wave motion looks like turning
-    is_tilting = max(float(np.abs(each).max()) for each in changing_tilt) > LEVEL_BELOW
+    is_tilting = max(float(np.abs(axis).max()) for axis in changing_tilt) > LEVEL_BELOW
     # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
     is_observable = is_tilting and fast.bend_gain > LEAST_OF_BEND
     circular = _noise_in_reference(seen, fast)
@@ -367,7 +367,7 @@ def residual_warnings(
         severity = Severity.MARGINAL if error > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
         reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(error)).weighed(severity))
-    if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
+    if all(reason.severity is Severity.WARNING for reason in reasons):  # a wrong tilt or heading looks like a beam
         reasons += beam_warning(beam, max(accepted, second_order))
     return reasons + _bias_warnings(found, mounting_std, accepted)
 

@@ -116,7 +116,7 @@ def water_document(water: Water) -> dict[str, Any]:
 
 def water_of_document(document: Mapping[str, Any]) -> Water:
     """Read the output of `water_document`. Raise LookupError, TypeError or ValueError if it is invalid."""
-    values = {each.name: document[_KEYS.get(each.name, each.name)] for each in fields(Water)}
+    values = {column.name: document[_KEYS.get(column.name, column.name)] for column in fields(Water)}
     source = str(values.pop("source"))
     return Water(**{name: math.nan if each is None else float(each) for name, each in values.items()}, source=source)
 
@@ -141,7 +141,7 @@ def cause_of_scale(
     state: of a model, x (n,), P (n, n) of this recording, without day-to-day variation.
     """
     scale = scale_and_delay(model, state, parameters)
-    is_shown = all(each.observed for each in observability(model, state.p, parameters) if each.axis == "scale")
+    is_shown = all(entry.observed for entry in observability(model, state.p, parameters) if entry.axis == "scale")
     if scale.scale_std is None or not is_shown:
         return cause_of_setting(water)
     return cause(water, scale.scale, scale.scale_std)

@@ -221,14 +221,14 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
         name = calibrations[0].name if calibrations else "nothing"
         raise InputError(f"{name}: one alone cannot be compared; name two")
     ordered = sorted(calibrations, key=lambda each: each.first_ns)  # stable for equal stamps
-    ordered = [replace(each, value=_near(each.value, ordered[0].value)) for each in ordered]
+    ordered = [replace(calibration, value=_near(calibration.value, ordered[0].value)) for calibration in ordered]
     pairs = [Difference.between(*two) for two in combinations(ordered, 2)]
     if not any(pair.compared[MOUNTING].any() for pair in pairs):
         raise InputError(
-            f"{', '.join(each.name for each in ordered)}: no angle is observable in two of them, so there is nothing "
-            "to compare; calibrate on more data (dvl-calib doctor says what is missing)"
+            f"{', '.join(calibration.name for calibration in ordered)}: no angle is observable in two of them, so "
+            "there is nothing to compare; calibrate on more data (dvl-calib doctor says what is missing)"
         )
-    accepted = [each for each in ordered if not each.rejected]
+    accepted = [calibration for calibration in ordered if not calibration.rejected]
     series = accepted or ordered
     instants = max(len(series) - 1, 1)
     together = cache(fused)
@@ -239,7 +239,7 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
         pairs=tuple(pairs),
         moved=tuple(moved),
         suspicious=tuple(change for change in changes if change not in moved),
-        suspected=tuple(_suspected(series, [each for each in ordered if each not in series])),
+        suspected=tuple(_suspected(series, [calibration for calibration in ordered if calibration not in series])),
         scale_changed=tuple(_changes(series, ONLY_SCALE, CHANCE / instants, together)),
         clock_changed=tuple(_changes(series, ONLY_CLOCK, CHANCE / instants, together)),
         scatter=_scatter(series, [change.first_after for change in changes], together),
@@ -257,10 +257,10 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     if len(several) == 1:
         return several[0]
     base = several[0]
-    if any(not each.dvl or each.dvl != base.dvl for each in several):
-        several = [replace(each, dvl="", by_bias=np.zeros_like(each.by_bias)) for each in several]
-    observable = np.any([each.shown for each in several], axis=0)
-    values = np.array([_near(each.value, base.value) for each in several])
+    if any(not calibration.dvl or calibration.dvl != base.dvl for calibration in several):
+        several = [replace(calibration, dvl="", by_bias=np.zeros_like(calibration.by_bias)) for calibration in several]
+    observable = np.any([calibration.shown for calibration in several], axis=0)
+    values = np.array([_near(calibration.value, base.value) for calibration in several])
     value, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: value of the first
     covariance = np.zeros((N_COMPONENTS, N_COMPONENTS))
     own, by_biases = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
@@ -278,14 +278,14 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     return replace(
         base,
         name=f"{len(several)} together",
-        model=" ".join(dict.fromkeys(each.model for each in several)),
-        last_ns=max(each.last_ns for each in several),
+        model=" ".join(dict.fromkeys(calibration.model for calibration in several)),
+        last_ns=max(calibration.last_ns for calibration in several),
         value=value,
         covariance=covariance + by_bias @ by_bias.T,
         shown=observable,
         dvl=several[0].dvl,
         by_bias=by_bias,
-        used=sum(each.used for each in several),
+        used=sum(calibration.used for calibration in several),
         remarks=(),
     )
 
@@ -335,9 +335,9 @@ def _suspected(series: Sequence[Extrinsics], rejected: Sequence[Extrinsics]) -> 
 def _smallest(differences: Sequence[Difference]) -> Array:
     """Return the movement (3,) rad of each angle that is found with `POWER` in the least certain difference."""
     found = np.full(N_AXES, np.nan)
-    for each in differences:
-        level = SUSPICIOUS / (len(differences) * max(int(each.compared.sum()), 1))
-        found = np.fmax(found, smallest_found(level, POWER) * each.std[ANGLES])
+    for difference in differences:
+        level = SUSPICIOUS / (len(differences) * max(int(difference.compared.sum()), 1))
+        found = np.fmax(found, smallest_found(level, POWER) * difference.std[ANGLES])
     return found
 
 
@@ -421,15 +421,15 @@ def scale_changed(change: Change) -> Reason:
 def remarks(comparison: Comparison) -> list[Reason]:
     """Say what makes differences less reliable than their σ."""
     found = [
-        finding("CALIBRATION_DOUBTED", name=each.name, remark=remark)
-        for each in comparison.calibrations
-        for remark in each.remarks
+        finding("CALIBRATION_DOUBTED", name=calibration.name, remark=remark)
+        for calibration in comparison.calibrations
+        for remark in calibration.remarks
     ]
-    models = dict.fromkeys(each.model for each in comparison.calibrations)
+    models = dict.fromkeys(calibration.model for calibration in comparison.calibrations)
     if len(models) > 1:
         found.append(finding("MODELS_DIFFER", models=", ".join(models)))
-    assumed = [each for each in comparison.calibrations if not each.shown[LEVER_ARM].any()]
-    estimated = [each for each in comparison.calibrations if each.shown[LEVER_ARM].any()]
+    assumed = [calibration for calibration in comparison.calibrations if not calibration.shown[LEVER_ARM].any()]
+    estimated = [calibration for calibration in comparison.calibrations if calibration.shown[LEVER_ARM].any()]
     for each in assumed:
         for other in (*estimated, *assumed):
             gap = np.where(
@@ -468,15 +468,15 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     return {
         "verdict": comparison.word,
         "same_mounting": comparison.same_mounting,
-        "says": [each.full_sentence for each in findings],
-        "remarks": [str(each) for each in remarked],
-        "findings": [each.as_dict() for each in (*findings, *remarked)],
+        "says": [reason.full_sentence for reason in findings],
+        "remarks": [str(reason) for reason in remarked],
+        "findings": [reason.as_dict() for reason in (*findings, *remarked)],
         "calibrations": [
-            {name: getattr(each, name) for name in ("name", "model", "first_ns", "last_ns", "used", "rejected")}
-            | {"value": _named(each.value), "std": _named(each.std)}
-            for each in comparison.calibrations
+            {name: getattr(calibration, name) for name in ("name", "model", "first_ns", "last_ns", "used", "rejected")}
+            | {"value": _named(calibration.value), "std": _named(calibration.std)}
+            for calibration in comparison.calibrations
         ],
-        "pairs": [_difference_document(each) for each in comparison.pairs],
+        "pairs": [_difference_document(pair) for pair in comparison.pairs],
         **{
             name: [
                 {"last_before": change.last_before.name, "first_after": change.first_after.name}

@@ -301,7 +301,7 @@ def navigated(held: HeldOutLegs, fit: DisplacementFit, parameters: Parameters, f
     ends = ends_of_stretches(distance)
     stretch_m = float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]])
     kept = np.round(np.linspace(0, len(at) - 1, min(MAP_POINTS, len(at)))).astype(np.intp)
-    in_body = [_velocities(each, seconds, legs.rotation[at])[kept] for each in track_errors]
+    in_body = [_velocities(track_error, seconds, legs.rotation[at])[kept] for track_error in track_errors]
     return Navigation(
         distance_m=float(distance[-1]), seconds=float(np.append(0.0, np.where(goes_on, np.diff(seconds), 0.0)).sum()),
         stretch_m=stretch_m, stretches=len(ends) - 1, before=drift_over(track_errors[0], distance, ends),
@@ -360,7 +360,7 @@ def held_out(held: HeldOutLegs, fit: DisplacementFit, parameters: Parameters) ->
     legs, ends = held.legs, _ends(held, fit)
     if not len(ends):
         return None
-    fold_of_leg = held.folds[[each.first[0] for each in ends]]
+    fold_of_leg = held.folds[[end.first[0] for end in ends]]
     of_all = _velocity_errors(legs, ends, fit, fit.errors.x, parameters)
     before = _velocity_errors(legs, ends, fit, np.zeros(N_ERRORS), parameters)
     sums = np.zeros(5)

@@ -158,7 +158,7 @@ def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
 
     errors = theta[:N_ERRORS]
     nudges = 1e-5 * np.eye(N_ERRORS)
-    slopes = [(matrix(errors + each) - matrix(errors - each)) / 2e-5 for each in nudges]
+    slopes = [(matrix(errors + nudge) - matrix(errors - nudge)) / 2e-5 for nudge in nudges]
     columns = np.empty((len(legs.seconds), 3, N_THETA))
     for state, slope in enumerate(slopes):
         columns[:, :, state] = np.einsum("nabc,bc->na", legs.way, slope)

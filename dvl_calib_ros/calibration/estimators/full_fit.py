@@ -210,7 +210,7 @@ class JointFit:
         """Take the next block. Raise numpy.linalg.LinAlgError and keep the earlier fit if numbers diverge."""
         day = self._days[-1]
         state = self._x.copy(), self._fitted, self.used, self.gated, self._misfit
-        kept = [(each, replace(each, blocks=[*each.blocks], sections=[*each.sections])) for each in self._days]
+        kept = [(day, replace(day, blocks=[*day.blocks], sections=[*day.sections])) for day in self._days]
         try:
             self._add(day, block)
             assert self._fitted is not None
@@ -415,7 +415,7 @@ class JointFit:
         if self._without is None or self._without[0] is not self._fitted:
             ended, states = [self._ended_without_folds(day) for day in self._days], []
             for fold in range(FOLDS):
-                without = [each and each.part(slice(fold, fold + 1)) for each in ended]
+                without = [state and state.part(slice(fold, fold + 1)) for state in ended]
                 found = self._mixture(without, self._likeliest, self._climbs(fold))
                 states.append(self._by_day(found.state))
             self._without = self._fitted, states
@@ -494,7 +494,7 @@ class JointFit:
         """Return the mean climb of every day that shows one. without: fold that is held out."""
         found = []
         for number, day in enumerate(self._days):
-            rows = [each.up for each in day.sections if each.up is not None and each.fold != without]
+            rows = [section.up for section in day.sections if section.up is not None and section.fold != without]
             if len(rows) > 1:
                 at, up = self._of_day(number), np.array(rows)
                 velocity = up[:, :-1] @ self._x[at] + up[:, -1]

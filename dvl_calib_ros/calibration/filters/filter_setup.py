@@ -136,7 +136,7 @@ LEAST_STD = 1e-7
 def prior(model: Model, parameters: Parameters) -> GaussianState:
     """Return zero errors with the prior standard deviations of the parameters."""
     std = [parameters.initial_std_misalignment] * 3 + [parameters.initial_std_scale] * (model.n_errors - 3)
-    std += [getattr(parameters, each.std) if isinstance(each.std, str) else each.std for each in model.nuisance]
+    std += [getattr(parameters, spec.std) if isinstance(spec.std, str) else spec.std for spec in model.nuisance]
     return GaussianState(np.zeros(model.n_state), np.diag(np.square(np.maximum(std, LEAST_STD))))
 
 

@@ -98,7 +98,7 @@ class Model:
     @cached_property
     def state_names(self) -> tuple[str, ...]:
         """Names of the states in order: misalignment (rad), scale-factor errors (dimensionless), nuisance states."""
-        scales, nuisance = (name for name, _ in self.scale_axes), (each.name for each in self.nuisance)
+        scales, nuisance = (name for name, _ in self.scale_axes), (spec.name for spec in self.nuisance)
         return (*MISALIGNMENT_STATES, *scales, *nuisance)
 
     @property

@@ -138,7 +138,7 @@ def inflations(
     """
     variance = np.diagonal(p, axis1=1, axis2=2)
     factor = np.ones(variance.shape)
-    counts = np.array([len(each.vector) for each in blocks])
+    counts = np.array([len(block.vector) for block in blocks])
     for count in sorted(set(counts[counts >= MIN_BLOCKS].tolist())):
         chosen = np.flatnonzero(counts == count)
         own = [(blocks[number], x[number]) for number in chosen.tolist()]

@@ -123,7 +123,7 @@ class Updated:
         x, p, used, nis = (
             np.concatenate(each) for each in zip(*((m.x, m.p, m.used, m.nis) for m in models), strict=True)
         )
-        found = [each.at for each in models if each.at is not None]
+        found = [model.at for model in models if model.at is not None]
         at = GaussianState(*(np.concatenate(each, axis=1) for each in zip(*found, strict=True))) if found else None
         return Updated(x, p, used, nis, at)
 

@@ -274,8 +274,8 @@ class Streams(NamedTuple):
 
     def halves(self) -> tuple[Streams, Streams]:
         """Return the first and second half of the rows by arrival."""
-        middle = np.sort(np.concatenate([each.arrival for each in self]))[sum(map(len, self)) // 2]
-        at = [int(np.searchsorted(each.arrival, middle)) for each in self]
+        middle = np.sort(np.concatenate([block.arrival for block in self]))[sum(map(len, self)) // 2]
+        at = [int(np.searchsorted(block.arrival, middle)) for block in self]
         return (
             Streams(*(each.part(slice(end)) for each, end in zip(self, at, strict=True))),
             Streams(*(each.part(slice(first, None)) for each, first in zip(self, at, strict=True))),
@@ -361,7 +361,7 @@ class AlignedBlock:
 
     def columns(self) -> tuple[NDArray[Any], ...]:
         """Return all columns, in the order of the fields."""
-        return tuple(getattr(self, each.name) for each in fields(self))
+        return tuple(getattr(self, column.name) for column in fields(self))
 
     @cached_property
     def usable(self) -> Mask:

@@ -61,9 +61,9 @@ def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, std_s:
     )
     # samples that are old when they are stamped have a configured delay, but no clock offset
     return [
-        each
-        for each in offsets
-        if min(abs(each.ahead), abs(ahead[each.stream] - ahead[base])) - std_s > limit_s(parameters)
+        offset
+        for offset in offsets
+        if min(abs(offset.ahead), abs(ahead[offset.stream] - ahead[base])) - std_s > limit_s(parameters)
     ]
 
 

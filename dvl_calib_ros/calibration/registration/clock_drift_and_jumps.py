@@ -163,11 +163,11 @@ def unsteady(
         return None
     # a delay without acceleration looks like a lever arm, which is the same in all stretches
     indices = [*range(N)[ARM], DELTA, RHO]
-    states = np.array([each.x[indices] for each in stretches])
+    states = np.array([stretch.x[indices] for stretch in stretches])
     lag_covariance = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
     # a stretch has few time blocks, so the autocorrelation of its residuals estimates lasting noise
-    noise_factors = [np.maximum(each.inflation / each.raised[indices], 1.0) for each in stretches]
-    covariances = np.array([each.p[np.ix_(indices, indices)] for each in stretches])
+    noise_factors = [np.maximum(stretch.inflation / stretch.raised[indices], 1.0) for stretch in stretches]
+    covariances = np.array([stretch.p[np.ix_(indices, indices)] for stretch in stretches])
     covariances *= np.array([np.outer(factor, factor) for factor in noise_factors])
     weights = np.linalg.inv(covariances + lag_covariance)
     names = DIRECTIONS if is_turned else {"dvl": DIRECTIONS["dvl"]}

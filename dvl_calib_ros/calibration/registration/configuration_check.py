@@ -172,7 +172,7 @@ def _fit_in_frame(fit: MotionFit, nominal: Array) -> _FrameFit | None:
     body_turned, dvl_turned = FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD
     give_up_above = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
     by_mounting = [nearest(fit, start, most=give_up_above) for start in (nominal, body_turned, dvl_turned, None)]
-    fitted = [each for each in by_mounting if each is not None]
+    fitted = [agreement for agreement in by_mounting if agreement is not None]
     if not fitted:
         return None
     turned = by_mounting[1]

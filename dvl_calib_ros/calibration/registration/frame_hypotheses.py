@@ -190,7 +190,7 @@ class Readings:
         if len(self) < FEWEST_VALUES:
             return []
         found = [self._agreement(reading, rotation_dvl_from_body) for reading in readings]
-        possible = [each for each in found if each is not None]
+        possible = [agreement for agreement in found if agreement is not None]
         # a small penalty prefers the smaller rotation; rounding makes ties stable (two inverted worlds fit equally)
         penalty = 0.02 if rotation_dvl_from_body is None else 0.0
         return sorted(possible, key=lambda each: round(each.residual + penalty * each.angle, 9))

@@ -273,11 +273,11 @@ def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: 
     max_misfit = MISFIT_LIMIT[0] * candidates[0].misfit + MISFIT_LIMIT[1] if candidates else 0.0
     delays = [(each.reference, each.dvl - each.reference) for each in candidates if each.misfit <= max_misfit]
     fits = [quick(rho, delta, rotation) for rho, delta in {*delays, (0.0, 0.0)}]
-    possible = [each for each in fits if each is not None and _is_possible(each)]
+    possible = [fit for fit in fits if fit is not None and _is_possible(fit)]
     if not possible:
         return None
     closest = min(possible, key=lambda each: each.level)
-    as_good = [each for each in possible if _is_as_good(motion, quick, each, closest, rotation)]
+    as_good = [candidate for candidate in possible if _is_as_good(motion, quick, candidate, closest, rotation)]
     return min(as_good, key=lambda each: abs(each.x[RHO]) + abs(each.dvl_delay_s))
 
 

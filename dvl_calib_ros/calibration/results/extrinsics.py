@@ -147,7 +147,7 @@ def rejection(findings: Iterable[Mapping[str, Any]]) -> str:
 
     A large misalignment alone does not invalidate the numbers: a mounting may have moved.
     """
-    sentences = (each["says"] for each in findings if each["severity"] == "reject" and each["code"] != _OF_SIZE)
+    sentences = (reason["says"] for reason in findings if reason["severity"] == "reject" and reason["code"] != _OF_SIZE)
     return str(next(sentences, ""))
 
 

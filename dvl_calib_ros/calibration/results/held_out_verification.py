@@ -208,8 +208,8 @@ def verification_document(verification: Verification) -> dict[str, Any]:
     held_out = verification.held_out
     return {
         "verdict": verification.verdict.value,
-        "reasons": [each.sentence for each in verification.reasons],
-        "findings": [each.as_dict() for each in verification.reasons],
+        "reasons": [reason.sentence for reason in verification.reasons],
+        "findings": [reason.as_dict() for reason in verification.reasons],
         "mounting": verification.mounting.sentence if verification.mounting is not None else "",
         "held_out": None
         if held_out is None

@@ -78,7 +78,7 @@ def not_shown(result: Result) -> dict[str, str]:
     mounted across, roll of the vehicle is pitch of the DVL. The scale across is omitted, because few vehicles can
     observe it.
     """
-    shown = {each.name for each in quantities(result) if each.shown}
+    shown = {quantity.name for quantity in quantities(result) if quantity.shown}
     causes: dict[str, dict[str, None]] = {}
     for entry in result.estimate.observability:
         if entry.axis in _NEED_IMU and not _has_imu(result):

@@ -279,7 +279,7 @@ class Result:
         std = estimate.std_of("time_offset")
         if std is None:
             return ()
-        shown = all(each.observed for each in estimate.observability if each.axis == "time offset")
+        shown = all(entry.observed for entry in estimate.observability if entry.axis == "time offset")
         return (Delay(None, estimate.dvl_time_offset(self.parameters["dvl_time_offset"]), float(std[0]), shown),)
 
 
@@ -337,7 +337,7 @@ def position_in_body(model: Model, state: GaussianState, parameters: Parameters)
     given = np.array(parameters.lever_arm)
     arm = given
     if parameters.dvl_position == FROM_REFERENCE:
-        seen = {each.name for each in observability(model, state.p, parameters) if each.observed}
+        seen = {entry.name for entry in observability(model, state.p, parameters) if entry.observed}
         shown: Mask = np.array([name in seen for name in _ARM])
         if not given.any() and not shown.all():
             return None
@@ -395,7 +395,7 @@ def corrected_rpy(misalignment: Array, parameters: Parameters) -> Array:
 def rpy_jacobian(misalignment: Array, parameters: Parameters) -> Array:
     """Return the derivative (3, 3) of roll, pitch, yaw of the corrected mounting with respect to φ (3,)."""
     up, down = (
-        np.array([corrected_rpy(misalignment + sign * each, parameters) for each in _SMALL_TURN * np.eye(3)])
+        np.array([corrected_rpy(misalignment + sign * turn, parameters) for turn in _SMALL_TURN * np.eye(3)])
         for sign in (1.0, -1.0)
     )
     return near_angles(up - down, 0.0).T / (2.0 * _SMALL_TURN)

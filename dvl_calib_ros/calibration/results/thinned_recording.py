@@ -113,10 +113,10 @@ class ThinnedRecording(NamedTuple):
     @staticmethod
     def of(kept: Sequence[ThinnedBlock]) -> ThinnedRecording:
         """Return the joined blocks."""
-        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
-        noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
-        reference = zip(*(each.reference for each in kept), strict=True)
-        imu = zip(*(each.imu for each in kept), strict=True)
+        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(block.dvl for block in kept), strict=True)))
+        noise = np.concatenate([np.full(len(block.dvl.times), np.trace(block.noise_dvl)) for block in kept])
+        reference = zip(*(block.reference for block in kept), strict=True)
+        imu = zip(*(block.imu for block in kept), strict=True)
         return ThinnedRecording(
             dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
         )

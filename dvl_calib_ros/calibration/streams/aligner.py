@@ -96,7 +96,7 @@ class Events(NamedTuple):
         order = np.argsort(arrival, kind="stable")
         event_of_sample = np.empty(len(order), dtype=np.intp)
         event_of_sample[order] = np.arange(len(order))
-        dvl_at, reference_at, imu_at = np.split(event_of_sample, np.cumsum([len(each) for each in arrivals[:2]]))
+        dvl_at, reference_at, imu_at = np.split(event_of_sample, np.cumsum([len(arrival) for arrival in arrivals[:2]]))
         newest_ns = []
         for events, stamps, newest_before in zip((dvl_at, reference_at, imu_at), stamps_ns, before_ns, strict=True):
             column = np.full(len(order), LONG_AGO_NS if newest_before is None else newest_before, dtype=np.int64)
@@ -114,7 +114,7 @@ def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
     """Check all rows for validity, and screen their values."""
     dvl, reference, imu = streams
     max_speed, believed = parameters.max_speed, parameters.use_message_covariance
-    dvl_screen, reference_screen = (screen_columns(each.covariances, believed) for each in (dvl, reference))
+    dvl_screen, reference_screen = (screen_columns(block.covariances, believed) for block in (dvl, reference))
     orientation, rates = unit_quaternions(imu.orientation), valid_rates(imu.angular_velocity)
     dvl_is_measured = dvl_screen.unmeasured == 0
     reference_is_measured = reference_screen.unmeasured != ALL_AXES
