@@ -25,7 +25,7 @@ from ..calibration.streams.interpolation import ImuColumns
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
-from ..recordings.topic_preview import Look, Survey
+from ..recordings.topic_preview import Preview, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason
 
@@ -182,22 +182,22 @@ def on_imu_clock(recording: Recording, topics: Topics, found: Registration) -> S
     delays_s = {topics.dvl: found.dvl.delay_s, topics.gnss: found.reference.delay_s}
     if not found.is_turned:  # without turns only the delay between DVL and reference is observable
         delays_s = {topics.dvl: found.apart.delay_s}
-    looks = {
-        name: replace(look, stamps_s=look.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
-        for name, look in survey.looks.items()
+    previews = {
+        name: replace(preview, stamps_s=preview.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
+        for name, preview in survey.previews.items()
     }
-    if topics.dvl in looks:
-        looks[topics.dvl] = _thinned(looks[topics.dvl])
-    return replace(survey, looks=looks)
+    if topics.dvl in previews:
+        previews[topics.dvl] = _thinned(previews[topics.dvl])
+    return replace(survey, previews=previews)
 
 
-def _thinned(look: Look) -> Look:
-    step = -(-len(look.stamps_s) // COMPARED)
-    rates, pose = (None if each is None else each[::step] for each in (look.rates, look.pose))
-    return replace(look, stamps_s=look.stamps_s[::step], values=look.values[::step], rates=rates, pose=pose)
+def _thinned(preview: Preview) -> Preview:
+    step = -(-len(preview.stamps_s) // COMPARED)
+    rates, pose = (None if each is None else each[::step] for each in (preview.rates, preview.pose))
+    return replace(preview, stamps_s=preview.stamps_s[::step], values=preview.values[::step], rates=rates, pose=pose)
 
 
-def difference_of(dvl: Look, reference: Look) -> float | None:
+def difference_of(dvl: Preview, reference: Preview) -> float | None:
     """Return the residual of two velocities after the best rotation, both taken in the body frame."""
     motion = compared_motion(dvl, reference, None)
     if motion is None:
@@ -206,17 +206,17 @@ def difference_of(dvl: Look, reference: Look) -> float | None:
     return found[0].best_residual if found else None
 
 
-def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:
+def compared_motion(dvl: Preview, reference: Preview, imu: Preview | None) -> MotionStreams | None:
     """Return the previewed samples as motion streams, in the messages' own axes; None if there are too few."""
     columns = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
     if imu is not None and imu.has_orientation:
         columns = imu_columns_of(imu)
     measured = True, True, bool(reference.values[:, 2].any())
-    dvl_motion, reference_motion = (in_order(look.stamps_s, look.values) for look in (dvl, reference))
+    dvl_motion, reference_motion = (in_order(preview.stamps_s, preview.values) for preview in (dvl, reference))
     return make_motion(dvl_motion, reference_motion, False, measured, columns)
 
 
-def imu_columns_of(imu: Look) -> ImuColumns:
+def imu_columns_of(imu: Preview) -> ImuColumns:
     """Return orientation and angular velocity of an IMU's topic as columns."""
     times, values = in_order(imu.stamps_s, imu.values)
     return ImuColumns(times, unit_quaternions(values[:, :4]), values[:, 4:7])

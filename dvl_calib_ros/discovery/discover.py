@@ -32,7 +32,7 @@ from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recording import Recording, open_recording
-from ..recordings.topic_preview import Look, Survey
+from ..recordings.topic_preview import Preview, Survey
 from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
@@ -120,8 +120,8 @@ class _Search:
     def run(self) -> Discovery:
         """Choose topics, then the frames of the DVL, if it has data."""
         topics = self._choose_topics()
-        looks = self._survey.looks
-        dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
+        previews = self._survey.previews
+        dvl, reference, imu = previews.get(topics.dvl), previews.get(topics.gnss), previews.get(topics.imu)
         if dvl is not None:
             self._choose_frames(dvl, *(in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
         self._found.insert(0, self._describe_topics(topics))
@@ -179,12 +179,12 @@ class _Search:
             if kind is None:
                 parts.append(f"no {role}")
                 continue
-            look = self._survey.looks.get(name)
-            rate = f", {look.rate_hz:.3g} Hz" if look is not None and look.rate_hz else ""
+            preview = self._survey.previews.get(name)
+            rate = f", {preview.rate_hz:.3g} Hz" if preview is not None and preview.rate_hz else ""
             frame = ""
-            if role == "reference" and look is not None:
+            if role == "reference" and preview is not None:
                 chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame
-                declared = self._declared_reference(look)
+                declared = self._declared_reference(preview)
                 if chosen == FROM_FRAME_ID:
                     chosen = "" if declared is None else declared.name
                 frame = f", {chosen}" if chosen else ""
@@ -194,7 +194,7 @@ class _Search:
     def _is_given(self, name: str) -> bool:
         return name in self._given.parameters
 
-    def _choose_frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
+    def _choose_frames(self, dvl: Preview, reference: Preview | None, imu: Preview | None) -> None:
         """Choose mounting, axes and frames from transforms, motion and gravity; note what was found."""
         placed = self._place_dvl(dvl)
         mounting = self._parameters.rotation_dvl_from_body.T if self._is_given("mounting_rpy") else None
@@ -248,7 +248,7 @@ class _Search:
             self._use_claimed_heading(imu)
             self._check_gravity(imu)
 
-    def _lower_min_speed(self, dvl: Look) -> None:
+    def _lower_min_speed(self, dvl: Preview) -> None:
         """Set min_speed of a vehicle that mostly moves more slowly than the default."""
         speed = np.linalg.norm(dvl.values, axis=1)
         moving = speed[speed > SLOWEST_MPS]
@@ -275,7 +275,7 @@ class _Search:
                 "lever arm are in these axes (base_axes frd)"
             )
 
-    def _check_gravity(self, imu: Look) -> None:
+    def _check_gravity(self, imu: Preview) -> None:
         """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
         gravity, parameters = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
         if gravity is not None and (
@@ -285,7 +285,7 @@ class _Search:
         ):
             self._contradictions.append(found)
 
-    def _use_claimed_heading(self, imu: Look) -> None:
+    def _use_claimed_heading(self, imu: Preview) -> None:
         """Set the heading accuracy that the IMU claims."""
         std = believed_heading(imu.claimed_std)
         if self._is_given("heading_deviation_std") or std is None:
@@ -296,7 +296,7 @@ class _Search:
             f"(-p heading_deviation_std:={std:.2g})"
         )
 
-    def _set_position(self, placed: Placed | None, reference: Look | None) -> None:
+    def _set_position(self, placed: Placed | None, reference: Preview | None) -> None:
         """Set the knowledge about the DVL's position in the body, which needs more than the lever arm."""
         if self._is_given("dvl_position"):
             return
@@ -311,7 +311,7 @@ class _Search:
         elif is_known:
             self._values["dvl_position"] = TOLD
 
-    def _known_reference_position(self, reference: Look) -> Array | None:
+    def _known_reference_position(self, reference: Preview) -> Array | None:
         """Return the position of the reference point in the body; None if unknown."""
         placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
         if placed is not None and _is_located(placed):
@@ -322,7 +322,7 @@ class _Search:
         says_body = named is not None and named.frame is VelocityFrame.BODY
         return np.zeros(3) if in_body and says_body else None
 
-    def _place_dvl(self, dvl: Look) -> Placed | None:
+    def _place_dvl(self, dvl: Preview) -> Placed | None:
         """Return the DVL's mounting by transforms; with an unknown frame, by a frame whose name indicates a DVL."""
         base_frame = self._parameters.base_frame
         frame = self._parameters.dvl_frame or dvl.frame_id
@@ -347,11 +347,11 @@ class _Search:
         name = frame_id.strip("/")
         return name == self._parameters.base_frame.strip("/") or name.lower() in EARTH_FRAMES
 
-    def _declared_reference(self, reference: Look) -> DeclaredFrame | None:
+    def _declared_reference(self, reference: Preview) -> DeclaredFrame | None:
         base = self._values.get("base_frame", self._parameters.base_frame)
         return declared_reference(reference, self._parameters, base)
 
-    def _reference_frame(self, reference: Look | None) -> VelocityFrame | None:
+    def _reference_frame(self, reference: Preview | None) -> VelocityFrame | None:
         """Return the assumed frame of the reference; None without one, or if unknown."""
         if reference is None:
             return None
@@ -359,7 +359,7 @@ class _Search:
         declared = self._declared_reference(reference) if chosen_name is None else DECLARED_FRAMES[chosen_name]
         return None if declared is None else declared.frame
 
-    def _knows_imu(self, imu: Look | None) -> bool:
+    def _knows_imu(self, imu: Preview | None) -> bool:
         """Return whether the IMU's orientation in the body is known: by a transform, or DVL and reference agree."""
         if imu is None:
             return False
@@ -372,9 +372,9 @@ class _Search:
     def _fit(
         self,
         frames: FrameChooser,
-        dvl: Look,
-        reference: Look,
-        imu: Look | None,
+        dvl: Preview,
+        reference: Preview,
+        imu: Preview | None,
         known: Array | None,
         placed: Placed | None,
     ) -> FrameChoice | None:
@@ -387,7 +387,7 @@ class _Search:
         is_known = _is_located(placed) and self._known_reference_position(reference) is not None
         return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
 
-    def _use_reading(self, chosen: Agreement, known: Array | None, reference: Look, imu: Look | None) -> None:
+    def _use_reading(self, chosen: Agreement, known: Array | None, reference: Preview, imu: Preview | None) -> None:
         """Write the frames and mounting of a reading into the parameters."""
         reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)
@@ -421,7 +421,7 @@ class _Search:
                 level_residual, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
                 self._mounting_found(level if BETTER * level_residual <= turned_residual else rpy, why)
 
-    def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
+    def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Preview, reference: Preview) -> None:
         """Set the noise of a reference that claims none, far too little, or more than its velocities show."""
         if self._is_given("gnss_aided_std") or self._is_given("use_message_covariance"):
             return
@@ -476,7 +476,7 @@ class _Search:
         self._mounting_because = why
         self._notes.append(mounting_guessed(rpy, why))
 
-    def _mounting_from_motion(self, dvl: Look, turned: bool, known: Array | None) -> None:
+    def _mounting_from_motion(self, dvl: Preview, turned: bool, known: Array | None) -> None:
         """Guess the mounting without a reference, assuming a vehicle that drives ahead, as the models without GNSS do.
 
         known: rotation_body_from_dvl (3, 3), None if unknown.
@@ -501,12 +501,12 @@ class _Search:
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 
-    def _reference_position(self, reference: Look) -> Array:
+    def _reference_position(self, reference: Preview) -> Array:
         """Return the position in the body of the point whose velocity the reference measures."""
         placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
         return np.zeros(3) if placed is None else placed.position
 
-    def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
+    def _place_lever_arm(self, placed: Placed, reference: Preview | None) -> None:
         """Set the lever arm by the transforms, from the reference's position; note the source."""
         given_mounting = self._is_given("mounting_rpy")
         parts = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]

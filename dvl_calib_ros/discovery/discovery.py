@@ -12,7 +12,7 @@ from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.clock_domains import limit_s
 from ..calibration.registration.frame_hypotheses import Agreement
 from ..recordings.recording import Recording
-from ..recordings.topic_preview import Look
+from ..recordings.topic_preview import Preview
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import FoundClocks, find_clocks
@@ -106,7 +106,7 @@ def clocks_of_recording(recording: Recording, found: Discovery, given: Given) ->
     return find_clocks(recording, found.topics, found.parameters, knows_mounting=knows_mounting, given=given.parameters)
 
 
-def in_time_of(dvl: Look, other: Look | None, parameters: Parameters) -> Look | None:
+def in_time_of(dvl: Preview, other: Preview | None, parameters: Parameters) -> Preview | None:
     """Shift stamps to the DVL's clock if the offset exceeds any delay that is estimated.
 
     Velocities of different times agree only in wrong frames. The replay reports the clock offset.

@@ -40,7 +40,7 @@ from ..calibration.streams.imu_frame import ENU_FROM
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import DECLARED_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.topic_preview import Look
+from ..recordings.topic_preview import Preview
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import imu_columns_of
 from .discovery import as_option
@@ -144,9 +144,9 @@ class FrameChooser:
         parameters: Parameters,
         given: frozenset[str],
         base_frame: str,
-        dvl: Look,
+        dvl: Preview,
         dvl_placed: Placed | None,
-        imu: Look | None,
+        imu: Preview | None,
         imu_placed: Placed | None,
     ) -> None:
         """Set up. given: names of parameters that the user set."""
@@ -235,7 +235,7 @@ class FrameChooser:
     def _dvl_axes_are_said(self) -> bool:
         return self._parameters.dvl_axes != FROM_MESSAGE or self._dvl.frame_id.lower().endswith(("_frd", "_flu"))
 
-    def _reference_priors(self, reference: Look, imu: ImuHypothesis | None) -> dict[str, float]:
+    def _reference_priors(self, reference: Preview, imu: ImuHypothesis | None) -> dict[str, float]:
         """Return the log odds of the frames that a reference may be in, by name."""
         z_down = self._says_z_down if imu is None else imu.z_down
         own_axes, other_axes = (FRD, FLU) if z_down else (FLU, FRD)
@@ -261,7 +261,7 @@ class FrameChooser:
             priors["body" if is_frd else FRD] += TWIST_RATES_OTHER
         return priors
 
-    def _points_down(self, reference: Look, imu: ImuHypothesis | None) -> bool:
+    def _points_down(self, reference: Preview, imu: ImuHypothesis | None) -> bool:
         """Return whether a twist is forward-right-down, by its turn rates or else by its pose's world."""
         if self._imu is not None and imu is not None and reference.rates is not None:
             is_frd = are_rates_frd(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
@@ -271,7 +271,7 @@ class FrameChooser:
         return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
 
     def choose(
-        self, readings: Readings, reference: Look, mounting: Array | None, arm_is_known: bool
+        self, readings: Readings, reference: Preview, mounting: Array | None, arm_is_known: bool
     ) -> FrameChoice | None:
         """Return the most likely reading; None if none can be evaluated.
 
@@ -412,7 +412,7 @@ def _arm_odds(fit: Registered) -> float:
     return -0.5 * min(float((fit.arm**2 / variance).sum()), MOST_OF_ARM)
 
 
-def declared_reference(reference: Look, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:
+def declared_reference(reference: Preview, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:
     """Return the frame that a reference declares; None if none."""
     if parameters.gnss_frame != FROM_FRAME_ID:
         return DECLARED_FRAMES[parameters.gnss_frame]
@@ -422,16 +422,16 @@ def declared_reference(reference: Look, parameters: Parameters, base_frame: str)
     return frame_named(reference.frame_id, (parameters.base_frame, base_frame))
 
 
-def twist_axes(look: Look) -> str | None:
+def twist_axes(preview: Preview) -> str | None:
     """Return the frame of an odometry's twist by the motion of its pose, as gnss_frame; None if not observable.
 
     Its pose p, R moves by the twist v: dp = R v dt if v is in the axes of the pose's body.
     """
-    if look.pose is None or not len(look.pose):
+    if preview.pose is None or not len(preview.pose):
         return None
-    quaternion = unit_quaternions(look.pose[:, 3:])
-    known = np.isfinite(quaternion).all(axis=1) & np.isfinite(look.values).all(axis=1)
-    times, position, velocity = look.stamps_s[known], look.pose[known, :3], look.values[known]
+    quaternion = unit_quaternions(preview.pose[:, 3:])
+    known = np.isfinite(quaternion).all(axis=1) & np.isfinite(preview.values).all(axis=1)
+    times, position, velocity = preview.stamps_s[known], preview.pose[known, :3], preview.values[known]
     if len(times) < 2:
         return None
     rotation = rotation_from_quaternion(quaternion[known])
@@ -452,9 +452,9 @@ def twist_axes(look: Look) -> str | None:
     hypotheses = {**in_body_axes, "enu": velocity, "ned": velocity @ ENU_FROM_NED}
     residuals = {name: residual(velocities) for name, velocities in hypotheses.items()}
     best, second = sorted(residuals, key=residuals.__getitem__)[:2]
-    if residuals[best] > MAX_RESIDUAL * look.speed or residuals[best] > BETTER_BY * residuals[second]:
+    if residuals[best] > MAX_RESIDUAL * preview.speed or residuals[best] > BETTER_BY * residuals[second]:
         return None
-    world = frame_named(look.world, ())
+    world = frame_named(preview.world, ())
     in_ned = world is not None and world.frame is VelocityFrame.NED
     if best in _BODY_AXES:
         body_down = (float(rotation[:, 2, 2].mean()) < 0.0) != in_ned

@@ -30,7 +30,7 @@ from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_messages import Recorded
-from ..recordings.topic_preview import Look
+from ..recordings.topic_preview import Preview
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding, full, is_cause
@@ -157,7 +157,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         recording = open_recording(recording, parameters=parameters)
     discovery = discover(recording, parameters, given)
     streams = _streams(recording, discovery)
-    looks = {role: recording.survey.looks.get(each.topic) for role, each in streams.items()}
+    looks = {role: recording.survey.previews.get(each.topic) for role, each in streams.items()}
     start_ns, end_ns = recording.span_ns
     recorded_s = 1e-9 * (end_ns - start_ns)
     seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
@@ -228,7 +228,7 @@ def judged_replay(
     if judged is None or judged.verdict is not Severity.REJECT or is_cause(judged.reasons[0]):
         return replayed
     streams = _streams(recording, discovery)
-    look = recording.survey.looks.get(streams["dvl"].topic)
+    look = recording.survey.previews.get(streams["dvl"].topic)
     findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
     errors = [reason for reason in findings if _has_error([reason])]
     if not errors or errors[0].code.startswith(NO_IMU):  # that there is no IMU is said before the verdict
@@ -254,7 +254,7 @@ def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | No
         return None, str(error).rstrip(".")
 
 
-def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> Content:
+def _content(role: str, topic: Recorded, look: Preview | None, rate_hz: float) -> Content:
     """Return name, type, rate and reported σ of a topic, as text."""
     variances = topic.variances[np.isfinite(topic.variances).all(axis=1)]
     if role == "imu":
@@ -277,7 +277,7 @@ def _claimed(variances: Array, window_s: float) -> str:
     return f"{window_s * math.sqrt(0.5 * float(np.median(variances))):.2g} m"
 
 
-def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> Array:
+def _body_velocity(dvl: Recorded, look: Preview | None, parameters: Parameters) -> Array:
     """Return the DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]

@@ -34,7 +34,7 @@ from .columns import Collector, Laid, TopicColumns, is_kept
 from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
-from .topic_preview import Survey, look_of
+from .topic_preview import Survey, preview_of
 from .topics import NONE, ORIENTATION, Topics, spelled
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
@@ -139,12 +139,12 @@ class Recording:
     def _surveyed(self, columns: Mapping[str, tuple[TopicColumns, ...]], *, whole: bool) -> Survey:
         """Return the previews of readable topics; of the others the reason why their first message cannot be read."""
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
-        looks = {
-            topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
-                           spans_ns, whole=whole)
+        previews = {
+            topic: preview_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic],
+                              start_ns, spans_ns, whole=whole)
             for topic, parts in columns.items()
         }  # fmt: skip
-        read = {topic: look for topic, look in looks.items() if look is not None}
+        read = {topic: preview for topic, preview in previews.items() if preview is not None}
         unread = {
             topic: reason
             for topic, parts in columns.items() if topic not in read

@@ -39,7 +39,7 @@ FASTEST = 1e5
 
 
 @dataclass(frozen=True)
-class Look:
+class Preview:
     """N messages of one topic.
 
     count: messages in the recording. rate_hz: average, 0 for a recording of an instant. frame_id: of the velocity or
@@ -91,21 +91,21 @@ class Survey:
 
     topics: Mapping[str, str]
     counts: Mapping[str, int]
-    looks: Mapping[str, Look]
+    previews: Mapping[str, Preview]
     transforms: tuple[Any, ...]
     descriptions: tuple[str, ...]
     unread: Mapping[str, str] = field(default_factory=dict)
     field_maps: Mapping[str, str] = field(default_factory=dict)
 
 
-def look_of(
+def preview_of(
     parts: Sequence[TopicColumns],
     count: int,
     start_ns: int,
     spans_ns: Sequence[tuple[int, int]],
     *,
     whole: bool = False,
-) -> Look | None:
+) -> Preview | None:
     """Return the preview of a topic, of which each recording has a part; None if no message can be read.
 
     start_ns: first log time of the recordings. spans_ns: start and end of each recorded stretch, in order. whole: all
@@ -141,7 +141,7 @@ def look_of(
         values, rates = np.hstack([values, extra]), np.full((0, 3), np.nan)
     known_rates = None if np.isnan(rates).all() else rates
     frame_id, claimed = numbers.frame_id, numbers.claimed_std
-    return Look(
+    return Preview(
         topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], known_rates, numbers.world, claimed,
         clock_rate, pose,
     )  # fmt: skip
