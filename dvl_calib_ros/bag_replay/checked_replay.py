@@ -47,9 +47,11 @@ DROPOUTS = "DVL_DROPOUTS"
 class Recordings:
     """Comparison of several recordings that were calibrated individually.
 
-    comparison: None if fewer than two recordings could be calibrated. unchecked: names of recordings that could not be.
-    overlapping: names of two with DVL data at the same time. pauses_ns: gaps between recordings. number: number of
-    recordings, counting bags of the same time as one.
+    comparison: None if fewer than two recordings could be calibrated.
+    unchecked: names of recordings that could not be.
+    overlapping: names of two with DVL data at the same time.
+    pauses_ns: gaps between recordings.
+    number: number of recordings, counting bags of the same time as one.
     """
 
     comparison: Comparison | None
@@ -94,9 +96,10 @@ def checked_replay(
     """Replay after checking several recordings, or an initial calibration, for consistency.
 
     merge: calibrate several recordings together even if the mounting moved; the move becomes a note instead of the
-    verdict. An `initial_calibration` that the data contradict is not used, with a finding. mounting_is_guessed:
-    mounting_rpy was not configured; if the estimate is far from it, the estimate becomes the mounting, and the replay
-    is repeated. contradictions: findings of discovery; those on frames affect the verdict. Raises InputError.
+      verdict. An `initial_calibration` that the data contradict is not used, with a finding.
+    mounting_is_guessed: mounting_rpy was not configured; if the estimate is far from it, the estimate becomes the
+      mounting, and the replay is repeated.
+    contradictions: findings of discovery; those on frames affect the verdict. Raises InputError.
     """
     topics = topics or Topics()
     if not isinstance(recording, Recording):

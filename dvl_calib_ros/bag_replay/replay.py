@@ -59,9 +59,11 @@ KEPT_STATES, KEPT_VELOCITIES = 300, 800
 class ModelHistory:
     """One model over time, at the N stamps of its `RunHistory`.
 
-    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names; std: (N, n).
-    misalignment_covariance: (N, 3, 3) rad². nis: (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the
-    previous stamp (about 1 for a consistent filter), nan if none was used.
+    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names.
+    std: (N, n).
+    misalignment_covariance: (N, 3, 3) rad².
+    nis: (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the previous stamp (about 1 for a consistent
+      filter), nan if none was used.
     """
 
     state: Array
@@ -76,8 +78,8 @@ class RunHistory:
 
     stamps_ns: (N,) of the rows of `models` and paired_share; a model's state includes all samples up to the stamp.
     paired_share: (N,) share of the DVL samples since the previous stamp with a reference, nan if none was decided.
-    dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, corrected to the reference point. paired_ns
-    (P,), reference_velocity (P, 3): DVL samples with a reference, and the reference, m/s, body frame.
+    dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, corrected to the reference point.
+    paired_ns (P,), reference_velocity (P, 3): DVL samples with a reference, and the reference, m/s, body frame.
     """
 
     stamps_ns: Stamps
@@ -209,12 +211,17 @@ BLOCK_SIZE = 1024
 class Replayed:
     """Result of a replay.
 
-    notes: all messages to the user, including the findings. history: estimates over time, if requested.
-    reference_frame: of the reference's messages, None without any. dvl_frame: frame_id of the DVL. dvl_type: message
-    type of its topic. turned: whether its data were converted from forward-right-down. recordings: comparison of
-    several recordings; None without one. pause_s: time between recordings within the first to the last sample.
+    notes: all messages to the user, including the findings.
+    history: estimates over time, if requested.
+    reference_frame: of the reference's messages, None without any.
+    dvl_frame: frame_id of the DVL.
+    dvl_type: message type of its topic.
+    turned: whether its data were converted from forward-right-down.
+    recordings: comparison of several recordings; None without one.
+    pause_s: time between recordings within the first to the last sample.
     navigation: dead reckoning without and with the selected model's correction, on held-out data; None without a
-    reference. water: its properties in the recording, if any.
+      reference.
+    water: its properties in the recording, if any.
     """
 
     result: Result
@@ -275,8 +282,10 @@ def replay(
 ) -> Replayed:
     """Calibrate with a recording, or with bags that are read as one in order of log time.
 
-    on_progress: receives the share (0..1) read. with_history: collect a `RunHistory`; else on_rows receives the aligned
-    rows and on_restart is called, as by `Calibrator`. judged: verify on held-out data, including dead reckoning.
+    on_progress: receives the share (0..1) read.
+    with_history: collect a `RunHistory`; else on_rows receives the aligned rows and on_restart is called, as by
+      `Calibrator`.
+    judged: verify on held-out data, including dead reckoning.
     on_finished: receives the calibrator at the end. Raises InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration

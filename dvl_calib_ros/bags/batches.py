@@ -27,7 +27,9 @@ Index = NDArray[np.intp]
 class Batch(NamedTuple):
     """N consecutive messages of a recording, in order of log time.
 
-    log_ns: (N,). number: (N,) of each message's channel in `channels`. start, end: (N,) bounds of each in `content`.
+    log_ns: (N,).
+    number: (N,) of each message's channel in `channels`.
+    start, end: (N,) bounds of each in `content`.
     """
 
     log_ns: Times

@@ -36,8 +36,9 @@ Stamps = NDArray[np.int64]
 class Part:
     """Messages of one channel in a window, in order.
 
-    arrival: (N,) positions among all messages read. log_ns: (N,). columns: of these messages, None if their layouts
-    differ.
+    arrival: (N,) positions among all messages read.
+    log_ns: (N,).
+    columns: of these messages, None if their layouts differ.
     """
 
     channel: Channel

@@ -37,8 +37,9 @@ _MARKER = Channel("", "")
 class BagReader:
     """Context manager that reads one or more recordings as one, in order of log time.
 
-    known: type -> known versions of its definition, for recordings without. notes: messages to the user on damage,
-    complete after the last message. topics: topic -> message type. Raises InputError for a path that is no bag.
+    known: type -> known versions of its definition, for recordings without.
+    notes: messages to the user on damage, complete after the last message.
+    topics: topic -> message type. Raises InputError for a path that is no bag.
     """
 
     def __init__(self, paths: Sequence[Path], known: Mapping[str, Sequence[str]] | None = None) -> None:

@@ -138,7 +138,9 @@ Salvage = Callable[[Path], Iterator[Salvaged]]
 class Source:
     """One recorded file.
 
-    path: as given by the user. counts: channel -> announced number of messages. span_ns: first and last log time.
+    path: as given by the user.
+    counts: channel -> announced number of messages.
+    span_ns: first and last log time.
     batches: messages of some topics, in order of log time; raises `DAMAGE` after the last, unless damage_noted.
     """
 
@@ -377,8 +379,9 @@ def message_of(error: Exception) -> str:
 class Database:
     """A recording in SQLite. Raises sqlite3.Error or DamagedError if it cannot be read.
 
-    counts: channel -> number of its messages. span_ns: first and last log time. astray: number of messages of unlisted
-    topics.
+    counts: channel -> number of its messages.
+    span_ns: first and last log time.
+    astray: number of messages of unlisted topics.
     """
 
     def __init__(self, path: Path) -> None:

@@ -178,7 +178,9 @@ class Assessor:
 class Estimates:
     """Estimates of a calibrator's models.
 
-    estimators: by model name. further: the estimators beyond the linear filter. models: names of the models in use.
+    estimators: by model name.
+    further: the estimators beyond the linear filter.
+    models: names of the models in use.
     parameters: replaced by the calibrator when parameters change at run time.
     """
 

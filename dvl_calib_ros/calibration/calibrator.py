@@ -63,13 +63,18 @@ _KINDS = {model.name: kind_of(model) for model in MODELS.values() if model.estim
 class Calibrator:
     """Calibration with all models in parallel; the module docstring has the data flow.
 
-    models: names of the models to run; each costs time, and the others have no estimate. prior_sway_heave: prior for
-    ``prior_source: reference`` (m/s), from the caller. initial: initial states by model name. block_size: number of
-    samples gathered before an update, unless a state is requested earlier. on_event: receives a sentence at every
-    restart. on_rows: receives the aligned rows in order, once all models have had them. on_restart: called at a
-    restart, which forgets all samples. verified: keep what hold-out verification needs. trace: filled with the models'
-    states over time. recordings_ns: stamps between recordings; each recording is a day of its own. worker: runs slow
-    work in a thread so that live messages do not wait; None runs it immediately, with the same results.
+    models: names of the models to run; each costs time, and the others have no estimate.
+    prior_sway_heave: prior for ``prior_source: reference`` (m/s), from the caller.
+    initial: initial states by model name.
+    block_size: number of samples gathered before an update, unless a state is requested earlier.
+    on_event: receives a sentence at every restart.
+    on_rows: receives the aligned rows in order, once all models have had them.
+    on_restart: called at a restart, which forgets all samples.
+    verified: keep what hold-out verification needs.
+    trace: filled with the models' states over time.
+    recordings_ns: stamps between recordings; each recording is a day of its own.
+    worker: runs slow work in a thread so that live messages do not wait; None runs it immediately, with the same
+      results.
     """
 
     def __init__(

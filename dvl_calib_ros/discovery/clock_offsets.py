@@ -44,8 +44,9 @@ COMPARED = 1500
 class FoundClocks:
     """Clock offsets of the streams.
 
-    offsets: by parameter, value to subtract, s, in addition to the configured one. far: clocks with offsets too large
-    to be registered. parameters: the frames used.
+    offsets: by parameter, value to subtract, s, in addition to the configured one.
+    far: clocks with offsets too large to be registered.
+    parameters: the frames used.
     """
 
     registration: Registration

@@ -33,11 +33,15 @@ class Given:
 class Discovery:
     """Discovered configuration.
 
-    found: findings with their sources, in sentences. notes: skipped alternatives. contradictions: contradictions
-    between the recording's data and its declarations. values: discovered parameters, which are included in
-    `parameters`. agreement: of DVL and reference, None if it could not be computed. reference_frame: assumed frame of
-    the reference. knows_imu: whether the IMU's axes are known. mounting_because: reason for a mounting guessed from the
-    data; else ''. clocks_given: clock parameters before the offsets in `parameters` were added.
+    found: findings with their sources, in sentences.
+    notes: skipped alternatives.
+    contradictions: contradictions between the recording's data and its declarations.
+    values: discovered parameters, which are included in `parameters`.
+    agreement: of DVL and reference, None if it could not be computed.
+    reference_frame: assumed frame of the reference.
+    knows_imu: whether the IMU's axes are known.
+    mounting_because: reason for a mounting guessed from the data; else ''.
+    clocks_given: clock parameters before the offsets in `parameters` were added.
     """
 
     topics: Topics

@@ -91,8 +91,9 @@ POSE_STEP_S, POSE_LONGEST_S = 0.5, 1.5
 class FrameChoice:
     """The chosen reading.
 
-    agreement: its fit. imu: its hypothesis of the IMU. says: doubts, such as another reading that fits equally well
-    with another mounting.
+    agreement: its fit.
+    imu: its hypothesis of the IMU.
+    says: doubts, such as another reading that fits equally well with another mounting.
     """
 
     agreement: Agreement
@@ -384,7 +385,8 @@ def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Arr
 def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None, travel: Array) -> Reason:
     """Return the finding that another mounting fits; its remedy also names a heading offset or axes that look the same.
 
-    given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
+    given, found: (3, 3) rotation_body_from_dvl.
+    imu: by which the reference is turned into the body, None for none.
     travel: (3,) m/s, mean velocity in the DVL. It is ahead with `given` if the heading is wrong, else with `found`.
     """
     rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)

@@ -31,10 +31,14 @@ PASSES = 3
 class EffectInput:
     """Motion that an effect acts on: the truth in the simulator, its best estimate in the diagnosis.
 
-    time: (N,) s, increasing. velocity_body: (N, 3) m/s over ground of the reference point, forward-left-up.
-    rotation_dvl_from_body: (3, 3) T. rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame;
-    None if not recorded. reference_frame: frame in which the reference velocity was recorded; a delay or filter in that
-    frame rotates with the vehicle only if it is the body. start: s, beginning of the recording; None: the first time.
+    time: (N,) s, increasing.
+    velocity_body: (N, 3) m/s over ground of the reference point, forward-left-up.
+    rotation_dvl_from_body: (3, 3) T.
+    rotation_enu_from_body: (N, 3, 3).
+    angular_velocity: (N, 3) rad/s, body frame; None if not recorded.
+    reference_frame: frame in which the reference velocity was recorded; a delay or filter in that frame rotates with
+      the vehicle only if it is the body.
+    start: s, beginning of the recording; None: the first time.
     """
 
     time: Array
@@ -110,9 +114,11 @@ class ActsOn(Enum):
 class EffectParameter:
     """One parameter of an effect.
 
-    typical: a relevant size, in `unit`. low, high: bounds. default: value if not given; an effect with all defaults
-    does nothing. linear: the trace is linear in it, with the others fixed. said: text displayed before value and unit,
-    '' if the effect's name suffices; None: `name`.
+    typical: a relevant size, in `unit`.
+    low, high: bounds.
+    default: value if not given; an effect with all defaults does nothing.
+    linear: the trace is linear in it, with the others fixed.
+    said: text displayed before value and unit, '' if the effect's name suffices; None: `name`.
     """
 
     name: str
@@ -151,7 +157,9 @@ def vector(values: Mapping[str, float], suffix: str) -> Array:
 class AnyEffect:
     """Base of systematic effects and of effects on the noise.
 
-    name: as in the documentation. parameters: in the order of `values`. needs: data that a recording must have.
+    name: as in the documentation.
+    parameters: in the order of `values`.
+    needs: data that a recording must have.
     confounded_with: effects that some data cannot distinguish from this one.
     """
 
@@ -171,11 +179,13 @@ class AnyEffect:
 class Effect(AnyEffect, ABC):
     """A systematic effect: the same motion always gives the same trace.
 
-    remedy: what to do about it, as part of a sentence. manoeuvre: motion that makes it observable and distinguishes it
-    from confounded effects. per_recording: whether its size differs per recording; else it belongs to the vehicle.
-    relative_to_first: whether it is a change from the first of several recordings. again: parameters of a second
-    occurrence, searched after a first was found -> those of the first. rarer: parameters searched only if several
-    recordings need them. of_velocity: whether the trace depends on the velocity of the motion.
+    remedy: what to do about it, as part of a sentence.
+    manoeuvre: motion that makes it observable and distinguishes it from confounded effects.
+    per_recording: whether its size differs per recording; else it belongs to the vehicle.
+    relative_to_first: whether it is a change from the first of several recordings.
+    again: parameters of a second occurrence, searched after a first was found -> those of the first.
+    rarer: parameters searched only if several recordings need them.
+    of_velocity: whether the trace depends on the velocity of the motion.
     """
 
     remedy: ClassVar[str] = ""

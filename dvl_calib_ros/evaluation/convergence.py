@@ -41,7 +41,9 @@ def squared_errors(
 ) -> Array:
     """Return squared errors of φ on one run (curves, T, 3) rad², averaged over combinations; nan for unusable models.
 
-    measured: (B, N, 3) m/s. references: noise -> (B, N, 3) m/s. failures: receives exceptions.
+    measured: (B, N, 3) m/s.
+    references: noise -> (B, N, 3) m/s.
+    failures: receives exceptions.
     """
     ends = [run.first(seconds) for seconds in TIMES_S]
     cut = slice(0, ends[-1])

@@ -38,12 +38,18 @@ from .results import Failure, Improvement
 class CrossCheck(Answering):
     """Velocity error (vector RMSE, m/s) of the DVL against GNSS on bags that were not used for calibration.
 
-    The noise of GNSS is included. bags: (L,). models: (M,). n_paired: (L,) samples with a reference. uncorrected: (L,)
-    by verifying bag. corrected: (L, M, L) by calibrating bag, model and verifying bag; nan on the bag itself, without
-    paired samples, and for models without usable data. A model with lever arm and delay corrects both, with the delay
-    estimated from the verifying bag if observable. selected: (L,) model of each calibrating bag for `navigation`.
-    navigation: dead reckoning by (calibrating, verifying) bag. notes: messages of the replays. found: results of
-    discovery.
+    The noise of GNSS is included.
+    bags: (L,).
+    models: (M,).
+    n_paired: (L,) samples with a reference.
+    uncorrected: (L,) by verifying bag.
+    corrected: (L, M, L) by calibrating bag, model and verifying bag; nan on the bag itself, without paired samples, and
+      for models without usable data. A model with lever arm and delay corrects both, with the delay estimated from the
+      verifying bag if observable.
+    selected: (L,) model of each calibrating bag for `navigation`.
+    navigation: dead reckoning by (calibrating, verifying) bag.
+    notes: messages of the replays.
+    found: results of discovery.
     """
 
     bags: tuple[str, ...]
@@ -77,9 +83,13 @@ class CrossCheck(Answering):
 class _Replayed:
     """Replay of one bag. parameters: with the bag's discovered values, described in found.
 
-    corrections: (M, 3, 3), nan for a model without samples. moments: of the paired samples, None without. delayed: by
-    model with a lever arm and delay, if it claims any, its corrections. recording: all streams, thinned. selected:
-    selected model and its corrections; None if it used nothing. dvl: its messages. failed: why there is no result.
+    corrections: (M, 3, 3), nan for a model without samples.
+    moments: of the paired samples, None without.
+    delayed: by model with a lever arm and delay, if it claims any, its corrections.
+    recording: all streams, thinned.
+    selected: selected model and its corrections; None if it used nothing.
+    dvl: its messages.
+    failed: why there is no result.
     """
 
     parameters: Parameters

@@ -111,8 +111,9 @@ LARGEST_ANGLES = np.array([np.pi, np.pi / 2, 2 * np.pi])
 class Trajectory:
     """A recorded run. Body frame forward-left-up.
 
-    time: (N,) s. velocity: (N, 3) m/s over ground, used as truth. rotation_enu_from_body: (N, 3, 3), angular_velocity:
-    (N, 3) rad/s in the body frame, None without attitude.
+    time: (N,) s.
+    velocity: (N, 3) m/s over ground, used as truth.
+    rotation_enu_from_body: (N, 3, 3), angular_velocity: (N, 3) rad/s in the body frame, None without attitude.
     """
 
     name: str

@@ -71,7 +71,9 @@ class Content:
 class Examination(Answering):
     """Result of the doctor.
 
-    judged: verdict of a replay, which decides. reasons: of that verdict. cannot: why there is no replay, else ''.
+    judged: verdict of a replay, which decides.
+    reasons: of that verdict.
+    cannot: why there is no replay, else ''.
     """
 
     paths: tuple[Path, ...]
@@ -376,7 +378,8 @@ _NAMES = ("roll", "pitch", "yaw", "scale")
 class Shown:
     """Observability of one error in a recording.
 
-    std: standard deviation of the calibration, degrees or per cent. share: progress from no knowledge (0) to fine (1).
+    std: standard deviation of the calibration, degrees or per cent.
+    share: progress from no knowledge (0) to fine (1).
     needs: the manoeuvre that improves it, '' if it is observable.
     """
 

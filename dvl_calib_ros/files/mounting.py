@@ -47,12 +47,15 @@ FUSION_NODE = "ekf_filter_node"
 class CalibratedMounting:
     """The selected model's calibration in a result file.
 
-    rotation_body_from_dvl (3, 3): corrected, of the calibrated forward-left-up axes. turned: whether the driver's data,
-    in dvl_frame, are forward-right-down and were converted to them. position: (3,) m in the body, None if unknown.
-    scale (3,): δk per DVL axis, 0 if not estimated. lever_arm (3,): m from the reference point, body frame, estimated
-    or configured. dvl_time_offset: delay, s, estimated or configured. objections: reasons not to apply it. doubts:
-    warnings when it is applied; both in sentences. water: its properties, and cause_of_scale: the scale explained by
-    them; None if unknown.
+    rotation_body_from_dvl (3, 3): corrected, of the calibrated forward-left-up axes.
+    turned: whether the driver's data, in dvl_frame, are forward-right-down and were converted to them.
+    position: (3,) m in the body, None if unknown.
+    scale (3,): δk per DVL axis, 0 if not estimated.
+    lever_arm (3,): m from the reference point, body frame, estimated or configured.
+    dvl_time_offset: delay, s, estimated or configured.
+    objections: reasons not to apply it.
+    doubts: warnings when it is applied; both in sentences.
+    water: its properties, and cause_of_scale: the scale explained by them; None if unknown.
     """
 
     path: Path
@@ -419,10 +422,13 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
 class Targets:
     """Files to write a calibration into; None for no file.
 
-    urdf: its DVL joint is rotated and moved. output: URDF to write instead. joint: the DVL's joint; None: the one above
-    the DVL's frame. keep_position: keep its xyz. params: parameter file of the node. launch: launch file (XML) with a
-    static transform. fusion: parameters of robot_localization (YAML). Raises InputError for options that need a URDF
-    without one.
+    urdf: its DVL joint is rotated and moved.
+    output: URDF to write instead.
+    joint: the DVL's joint; None: the one above the DVL's frame.
+    keep_position: keep its xyz.
+    params: parameter file of the node.
+    launch: launch file (XML) with a static transform.
+    fusion: parameters of robot_localization (YAML). Raises InputError for options that need a URDF without one.
     """
 
     urdf: Path | None = None
@@ -448,9 +454,11 @@ class Targets:
 class Applied:
     """Result of applying a calibration.
 
-    written: new or changed files, also planned ones. unchanged: files that already had the values. kept: path of each
-    replaced file's backup. notes: remarks for users of the files. changes: planned changes of a dry run, as a unified
-    diff.
+    written: new or changed files, also planned ones.
+    unchanged: files that already had the values.
+    kept: path of each replaced file's backup.
+    notes: remarks for users of the files.
+    changes: planned changes of a dry run, as a unified diff.
     """
 
     written: tuple[Path, ...]

@@ -40,8 +40,9 @@ class Joint:
 class UrdfMounting:
     """Mounting of the DVL in a URDF, by the fixed joints from the body to it.
 
-    joint: the last one, the DVL's own. rotation_body_from_dvl (3, 3), rotation_body_from_parent (3, 3): of the joint's
-    parent. position: m, in the body.
+    joint: the last one, the DVL's own.
+    rotation_body_from_dvl (3, 3), rotation_body_from_parent (3, 3): of the joint's parent.
+    position: m, in the body.
     """
 
     joint: Joint

@@ -273,9 +273,10 @@ def run_fleet(
 ) -> Fleet:
     """Calibrate new and changed recordings, and read the catalogue. The page is not written.
 
-    places: folders, files, URLs. given: named parameters and topics. vehicle_from: a regular expression; by default the
-    first folder below a place. Raises InputError for an invalid place, a catalogue that cannot be written, and
-    unavailable workers; finished recordings are kept.
+    places: folders, files, URLs.
+    given: named parameters and topics.
+    vehicle_from: a regular expression; by default the first folder below a place. Raises InputError for an invalid
+      place, a catalogue that cannot be written, and unavailable workers; finished recordings are kept.
     """
     if parameters.initial_calibration:
         raise InputError("initial_calibration: recordings of a fleet are each calibrated by themselves; leave it out")

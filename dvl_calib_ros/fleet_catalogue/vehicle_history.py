@@ -76,7 +76,8 @@ class CompassDeviation(NamedTuple):
 class WaterOfRecording(NamedTuple):
     """Water properties of a recording.
 
-    first_ns: stamp of the recording's first sample. used: speed of sound used by the DVL, m/s, nan if unknown.
+    first_ns: stamp of the recording's first sample.
+    used: speed of sound used by the DVL, m/s, nan if unknown.
     cause_of_scale: explanation of the scale by the water, in a sentence.
     """
 

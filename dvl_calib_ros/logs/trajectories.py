@@ -370,7 +370,10 @@ def column_map(text: str) -> Mapping[str, str]:
 def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float) -> DvlLog:
     """Read the velocities of a table. Raises InputError naming file and column.
 
-    text: the map. start_ns: stamp of time 0. rotation: (3, 3) to forward-left-up. std: m/s; 0: covariance not given.
+    text: the map.
+    start_ns: stamp of time 0.
+    rotation: (3, 3) to forward-left-up.
+    std: m/s; 0: covariance not given.
     """
     names = column_map(text)
     if not path.is_file():  # a pipe would block

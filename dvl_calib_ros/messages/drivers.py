@@ -65,8 +65,10 @@ _LARGEST = sys.float_info.max
 class Rule(NamedTuple):
     """A condition under which a message's velocity is invalid, even if plausible.
 
-    counter: name of the counter of such messages. says: the fault. broken: the test, for a message or for columns of
-    many, so it uses operators valid for both. remedy: what to do.
+    counter: name of the counter of such messages.
+    says: the fault.
+    broken: the test, for a message or for columns of many, so it uses operators valid for both.
+    remedy: what to do.
     """
 
     counter: str
@@ -84,15 +86,20 @@ class Rule(NamedTuple):
 class VelocityType:
     """One message type.
 
-    velocity: message -> object with x, y, z, m/s. covariance: message -> covariance of that velocity, row-major, 9
-    numbers or 36 of a twist, (m/s)²; None if not given. lacks_covariance: message -> whether the field is a
-    placeholder. frame_id: message -> frame of the velocity. is_read_in_columns: whether these functions also work on
-    columns of messages, which needs a type without lists. points_down: forward-right-down unless the frame's name says
-    otherwise. rules: of a DVL; the first broken one counts. is_reference, is_dvl: whether references and DVLs use this
-    type. position: how to read positions (positions.py), None for a type of velocities. reference_frame: axes of a
-    reference in this type regardless of frame_id; None to use frame_id. adapted: conversion of a message without
-    header; None if not needed. definitions: versions of the definition, for bags without. install: how to get the
-    package, if ROS does not have it.
+    velocity: message -> object with x, y, z, m/s.
+    covariance: message -> covariance of that velocity, row-major, 9 numbers or 36 of a twist, (m/s)²; None if not
+      given.
+    lacks_covariance: message -> whether the field is a placeholder.
+    frame_id: message -> frame of the velocity.
+    is_read_in_columns: whether these functions also work on columns of messages, which needs a type without lists.
+    points_down: forward-right-down unless the frame's name says otherwise.
+    rules: of a DVL; the first broken one counts.
+    is_reference, is_dvl: whether references and DVLs use this type.
+    position: how to read positions (positions.py), None for a type of velocities.
+    reference_frame: axes of a reference in this type regardless of frame_id; None to use frame_id.
+    adapted: conversion of a message without header; None if not needed.
+    definitions: versions of the definition, for bags without.
+    install: how to get the package, if ROS does not have it.
     """
 
     name: str

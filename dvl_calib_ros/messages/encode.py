@@ -31,7 +31,9 @@ class SatelliteFix(NamedTuple):
 class WaterReading(NamedTuple):
     """A DVL's water properties.
 
-    speed_of_sound: m/s, as used by the DVL. temperature: °C. salinity: PSU. nan if not measured.
+    speed_of_sound: m/s, as used by the DVL.
+    temperature: °C.
+    salinity: PSU. nan if not measured.
     """
 
     stamp_ns: int

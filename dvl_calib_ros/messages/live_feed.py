@@ -34,8 +34,9 @@ AnySample = TypeVar("AnySample", DvlSample, ReferenceSample, ImuSample)
 class MessageFeed:
     """Feeds a calibrator with decoded samples and refusals, which it counts.
 
-    decoder: the message decoder. on_problem: receives the text of its new problems. kept: messages for `begin_again`.
-    Raises InputError for unknown message types.
+    decoder: the message decoder.
+    on_problem: receives the text of its new problems.
+    kept: messages for `begin_again`. Raises InputError for unknown message types.
     """
 
     def __init__(self, calibrator: Calibrator, on_problem: Callable[[str], None] = lambda _: None) -> None:

@@ -161,8 +161,12 @@ def diagnose(
 ) -> DiagnosticStatus:
     """Return the status of the running calibration, still without a name.
 
-    dvl_type: type of the DVL's messages. problems: further problems. now_s: steady clock. pauses_s: recent pauses of
-    this process. card: further values for the operator. water: water properties, if known.
+    dvl_type: type of the DVL's messages.
+    problems: further problems.
+    now_s: steady clock.
+    pauses_s: recent pauses of this process.
+    card: further values for the operator.
+    water: water properties, if known.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     growth = recent.grown(counts, now_s)

@@ -332,8 +332,10 @@ class Answer(_Printable):
 class Document(_Printable):
     """Presentation of a result.
 
-    sections: in order; empty ones are omitted. parameters: parameters of the run by name, for the page. lead: a finding
-    before all others. folded: warnings that a page folds away.
+    sections: in order; empty ones are omitted.
+    parameters: parameters of the run by name, for the page.
+    lead: a finding before all others.
+    folded: warnings that a page folds away.
     """
 
     title: str

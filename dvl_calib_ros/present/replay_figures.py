@@ -280,8 +280,9 @@ def navigation_pictures(
 ) -> Sequence[Picture]:
     """Draw a map, if headings are known, and the error along the track.
 
-    one: its reference and uncorrected track are drawn. corrected: tracks by their correction ('' for a single one); the
-    first four are drawn. stamps_ns: of figures whose cursor the map follows.
+    one: its reference and uncorrected track are drawn.
+    corrected: tracks by their correction ('' for a single one); the first four are drawn.
+    stamps_ns: of figures whose cursor the map follows.
     """
     ends = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
     alt = f"over {one.distance_m:.0f} m; error at the end: as mounted {one.before.end:.1f} m; {ends}"

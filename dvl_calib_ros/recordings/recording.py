@@ -30,7 +30,7 @@ from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, POSE_TYPE
 from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, recognised, suggested
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from ..verdict.reasons import Reason, finding
-from .columns import Collector, Laid, TopicColumns, is_kept
+from .columns import Collector, DecodedRows, TopicColumns, is_kept
 from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
@@ -50,11 +50,18 @@ Span = tuple[int, int]
 class Recording:
     """One recording, or several as one.
 
-    types: topic -> message type. held: topic -> all its types. counts: topic -> number of messages. file_spans_ns: of
-    each file with a message. notes: messages to the user on damage. columns: of the topics that are kept, one part per
-    path. transforms: of tf_static. descriptions: of robot_description. parts: the recordings it was joined from, if
-    any. registrations: cached results of `register_as`. waters: its water properties. field_maps: topic of an unlisted
-    type -> field map for its likely velocity.
+    types: topic -> message type.
+    held: topic -> all its types.
+    counts: topic -> number of messages.
+    file_spans_ns: of each file with a message.
+    notes: messages to the user on damage.
+    columns: of the topics that are kept, one part per path.
+    transforms: of tf_static.
+    descriptions: of robot_description.
+    parts: the recordings it was joined from, if any.
+    registrations: cached results of `register_as`.
+    waters: its water properties.
+    field_maps: topic of an unlisted type -> field map for its likely velocity.
     """
 
     paths: tuple[Path, ...]
@@ -208,7 +215,8 @@ def open_recording(
 ) -> Recording:
     """Read recordings once, several as one in order of log time. Raises InputError for a path that is no bag.
 
-    topics: the only ones to keep; by default all useful ones. parameters: for messages' own validity rules (max_fom).
+    topics: the only ones to keep; by default all useful ones.
+    parameters: for messages' own validity rules (max_fom).
     on_progress: receives the share (0..1) read.
     """
     parameters = parameters or Parameters()
@@ -326,8 +334,10 @@ def _read(
 class _Contents:
     """Contents of a bag read so far.
 
-    topics: to be read. one_by_one: those of them whose messages do not fit columns. sensors, waters: collectors by
-    topic. transforms, descriptions: from the static topics.
+    topics: to be read.
+    one_by_one: those of them whose messages do not fit columns.
+    sensors, waters: collectors by topic.
+    transforms, descriptions: from the static topics.
     """
 
     def __init__(self, bag: BagReader, topics: Topics | None, parameters: Parameters) -> None:
@@ -445,7 +455,7 @@ def _poses_as_imus(columns: Collection[TopicColumns]) -> list[TopicColumns]:
     """Return the orientations of all topics of poses as IMUs; none if a recorded IMU may have an orientation."""
     imus = [column for column in columns if column.msgtype == IMU_TYPE]
     # messages without columns (singles) are not looked into
-    if any(len(column.singles) or hold_orientations(column.laid.values) for column in imus):
+    if any(len(column.singles) or hold_orientations(column.decoded.values) for column in imus):
         return []
     return [imu for imu in map(orientations_of, columns) if imu is not None]
 
@@ -466,12 +476,12 @@ def orientations_of(poses: TopicColumns) -> TopicColumns | None:
     (arrival, log_ns), stamps_ns = poses.arrivals, poses.stamps_ns
     values[known, 4:] = _turn_rates(stamps_ns[known], values[known, :4])
     n = len(poses)
-    laid = Laid(
+    decoded = DecodedRows(
         arrival, log_ns, stamps_ns, values, np.zeros(n, dtype=np.int32), np.full(n, -1, dtype=np.int32),
         np.zeros(n, dtype=np.uint8), np.full((n, 3), np.nan), frames=("",),
     )  # fmt: skip
     no_singles = poses.singles.part(np.zeros(0, dtype=np.intp))
-    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, laid, no_singles)
+    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, decoded, no_singles)
 
 
 def hold_orientations(values: Array) -> bool:

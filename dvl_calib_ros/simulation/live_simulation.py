@@ -34,8 +34,10 @@ REMEMBERED_CONSTANTS = 30.0
 class MotionSample:
     """Motion of the vehicle at one time.
 
-    time: s since the beginning. velocity_body: (3,) m/s over ground of the reference point. rotation_enu_from_body: (3,
-    3). angular_velocity: (3,) rad/s, body frame, forward-left-up.
+    time: s since the beginning.
+    velocity_body: (3,) m/s over ground of the reference point.
+    rotation_enu_from_body: (3, 3).
+    angular_velocity: (3,) rad/s, body frame, forward-left-up.
     """
 
     time: float

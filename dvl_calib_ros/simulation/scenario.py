@@ -44,8 +44,11 @@ GNSS_PHASE_S = 0.037
 class Scenario:
     """Configuration of a simulated run. Rates in Hz, standard deviations in m/s, times in s from the start.
 
-    recording: a bag that gives the motion instead of a trajectory. seconds: None is 600, or all of the recording.
-    outages: (from, to) without GNSS. gnss_frame: BODY or ENU. effects: in addition to the errors.
+    recording: a bag that gives the motion instead of a trajectory.
+    seconds: None is 600, or all of the recording.
+    outages: (from, to) without GNSS.
+    gnss_frame: BODY or ENU.
+    effects: in addition to the errors.
     """
 
     trajectory: str = "box"
@@ -78,7 +81,9 @@ class Run:
 class World:
     """Common input of all sensors, from `world_of`.
 
-    motion: the known motion. input: the same for effects. disturbed: applies the noise effects to a sensor's samples.
+    motion: the known motion.
+    input: the same for effects.
+    disturbed: applies the noise effects to a sensor's samples.
     """
 
     motion: Motion

@@ -35,8 +35,9 @@ NOT_EXPLAINED = "not_explained"
 class Other:
     """A diagnosed effect without its own number in the description.
 
-    size: rms, m/s, of its effect; None if unknown. of_the_reference: it affects the reference or the attitude, not the
-    DVL. of_another_day: difference of a recording from the first one, which is described.
+    size: rms, m/s, of its effect; None if unknown.
+    of_the_reference: it affects the reference or the attitude, not the DVL.
+    of_another_day: difference of a recording from the first one, which is described.
     """
 
     name: str
@@ -50,11 +51,16 @@ class Other:
 class DvlDescription:
     """Description of a DVL: SI, forward-left-up.
 
-    mounting_rpy: (3,) rad, `dvl_link` in the body as a URDF origin, misalignment included. lever_arm: (3,) m, of the
-    DVL from the reference point, body frame. scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
-    noise_std: (3,) m/s, of its axes. rate_hz: None if unknown. speed: (3,) m/s, rms along its axes. others: other
-    effects. source: file of origin. ambiguous: sets of indistinguishable effects, of which the first is used. doubts:
-    warnings, in sentences.
+    mounting_rpy: (3,) rad, `dvl_link` in the body as a URDF origin, misalignment included.
+    lever_arm: (3,) m, of the DVL from the reference point, body frame.
+    scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
+    noise_std: (3,) m/s, of its axes.
+    rate_hz: None if unknown.
+    speed: (3,) m/s, rms along its axes.
+    others: other effects.
+    source: file of origin.
+    ambiguous: sets of indistinguishable effects, of which the first is used.
+    doubts: warnings, in sentences.
 
     Raises InputError for numbers that are not finite, or a rate or noise that is not positive.
     """

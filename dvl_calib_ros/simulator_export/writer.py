@@ -32,9 +32,13 @@ class Missing:
 class Settings:
     """Output of a writer.
 
-    text: the file. found: settings by name from the description. defaults: the simulator's own ones. noise_std: (3,)
-    m/s of its axes with these settings; None at the default noise. scale: the common error of all axes. remarks: for
-    the user of the file. represented: effects in the file, `scale` or `velocity_bias`.
+    text: the file.
+    found: settings by name from the description.
+    defaults: the simulator's own ones.
+    noise_std: (3,) m/s of its axes with these settings; None at the default noise.
+    scale: the common error of all axes.
+    remarks: for the user of the file.
+    represented: effects in the file, `scale` or `velocity_bias`.
     """
 
     text: str

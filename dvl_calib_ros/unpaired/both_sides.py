@@ -34,10 +34,14 @@ DROPOUT_INTERVALS = 1.6
 class StreamFacts:
     """Properties of one recording's DVL messages, N in order of stamps.
 
-    steps: (N - 1,) s between stamps. latency: (N,) s from stamp to log time; empty if these are of different clocks.
-    values: (N, 3) m/s of valid messages, without zeros while moving. received: number of messages. missing, refused,
-    zero: number of events (runs) of missing messages, of messages marked invalid, of exact zeros while moving. lost:
-    number of samples in all of these. repeats: valid messages that repeat the previous velocity exactly.
+    steps: (N - 1,) s between stamps.
+    latency: (N,) s from stamp to log time; empty if these are of different clocks.
+    values: (N, 3) m/s of valid messages, without zeros while moving.
+    received: number of messages.
+    missing, refused, zero: number of events (runs) of missing messages, of messages marked invalid, of exact zeros
+      while moving.
+    lost: number of samples in all of these.
+    repeats: valid messages that repeat the previous velocity exactly.
     """
 
     steps: Array
@@ -121,7 +125,8 @@ class Log:
     """Diagnosis of one side.
 
     residuals: (N, 3) m/s per recording, recorded DVL velocity minus the fitted model's, DVL frame, at the DVL's stamps.
-    exact: the DVL has no noise of its own. copied: it has the noise of its reference.
+    exact: the DVL has no noise of its own.
+    copied: it has the noise of its reference.
     """
 
     diagnosis: Diagnosis

@@ -68,8 +68,9 @@ Slopes = dict[str, tuple[float, float]]
 class Scatter:
     """Noise samples of one recording. values: (N, 3) m/s, white if the DVL's noise is, of its standard deviation.
 
-    motion: at the samples. thin: step between independent samples. of_reference: m/s, upper limit of the reference's
-    part.
+    motion: at the samples.
+    thin: step between independent samples.
+    of_reference: m/s, upper limit of the reference's part.
     """
 
     values: Array

@@ -43,9 +43,10 @@ CALIBRATION, FEWEST_DOF = 6, 4
 class Size:
     """An effect's size on one side. values: (p,) its linear parameters, averaged over recordings if they differ.
 
-    stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p). dof: of that
-    covariance. found: the side's own diagnosis named it. recordings: names of those with their own size, none if they
-    share it.
+    stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p).
+    dof: of that covariance.
+    found: the side's own diagnosis named it.
+    recordings: names of those with their own size, none if they share it.
     """
 
     effect: Effect

@@ -94,9 +94,10 @@ def _values(size: Size) -> Values:
 class Shrunk:
     """Result of the ladder.
 
-    rungs: of the ladder. floor: m/s, error of the last rung without the vehicle's error beyond its noise, white and
-    slow. errors: (F, 3) m/s held out, DVL frame, by name of the model, nan if unknown. time: (F,) s since the start of
-    the recording recording_of (F,).
+    rungs: of the ladder.
+    floor: m/s, error of the last rung without the vehicle's error beyond its noise, white and slow.
+    errors: (F, 3) m/s held out, DVL frame, by name of the model, nan if unknown.
+    time: (F,) s since the start of the recording recording_of (F,).
     """
 
     rungs: tuple[Rung, ...]

@@ -70,9 +70,11 @@ class Lies:
 class ComparedEffect:
     """One effect on both sides. equivalent_to: effects that the data cannot distinguish from it.
 
-    vehicle, simulator: parameters; empty if not observable on that side. p: of equal sizes, adjusted (Holm) over all
-    claims; nan if not tested. adds_mps: rms of its addition to the vehicle's DVL (or, if only in the simulator, to
-    that), without the part absorbed by misalignment and scale. needs: what would make it observable.
+    vehicle, simulator: parameters; empty if not observable on that side.
+    p: of equal sizes, adjusted (Holm) over all claims; nan if not tested.
+    adds_mps: rms of its addition to the vehicle's DVL (or, if only in the simulator, to that), without the part
+      absorbed by misalignment and scale.
+    needs: what would make it observable.
     """
 
     name: str
@@ -103,9 +105,10 @@ class ComparedNoise:
 class Rung:
     """One model of the vehicle's DVL. name: the original simulator, or the effects added to it.
 
-    error_mps: rms of recorded minus simulated without noise, with limited outliers, on held-out stretches. distance:
-    energy distance between windows of both, with noise, in units of their spread. null95: its 95 % quantile if both are
-    alike. p: its p-value.
+    error_mps: rms of recorded minus simulated without noise, with limited outliers, on held-out stretches.
+    distance: energy distance between windows of both, with noise, in units of their spread.
+    null95: its 95 % quantile if both are alike.
+    p: its p-value.
     """
 
     name: str
@@ -119,9 +122,12 @@ class Rung:
 class UnpairedComparison(Answering):
     """Result of a comparison of a simulator with a vehicle.
 
-    reasons: the verdict first. effects: claims first, the largest first. noise: likewise, the most significant first.
-    levels: by regime, m/s RMS over the axes of vehicle and simulator. floor_mps: noise in `rungs` that no simulator can
-    remove. not_shown: per side, effects not observable at relevant sizes, with their smallest detectable size.
+    reasons: the verdict first.
+    effects: claims first, the largest first.
+    noise: likewise, the most significant first.
+    levels: by regime, m/s RMS over the axes of vehicle and simulator.
+    floor_mps: noise in `rungs` that no simulator can remove.
+    not_shown: per side, effects not observable at relevant sizes, with their smallest detectable size.
     """
 
     verdict: SimulatorVerdict

@@ -111,7 +111,9 @@ def _note(row: _TableRow, topics: dict[int, _Topic], definitions: dict[tuple[str
 class _Pages:
     """Pages of a database file, numbered from 1.
 
-    size: bytes per page. missing: bytes by which the file is shorter than its header states. unread: unreadable pages.
+    size: bytes per page.
+    missing: bytes by which the file is shorter than its header states.
+    unread: unreadable pages.
     """
 
     def __init__(self, file: BinaryIO, size: int) -> None:

@@ -64,7 +64,9 @@ class Drift:
 class SlowNoise(NamedTuple):
     """Slow errors of reference and attitude, first-order Gauss-Markov (σ).
 
-    velocity: m/s, per horizontal axis. heading: rad. memory_s: time constant, s.
+    velocity: m/s, per horizontal axis.
+    heading: rad.
+    memory_s: time constant, s.
     """
 
     velocity: float
@@ -148,8 +150,10 @@ def dead_reckoned(
 ) -> Navigation | None:
     """Compare the track of the DVL, uncorrected and corrected, with the reference; None without reference or motion.
 
-    folds: (N,) index into `terms` of each DVL sample's correction. epoch_ns: stamp of the recording's time 0. heading:
-    see `Estimate.heading_deviation`. slow, beam: None if not estimated.
+    folds: (N,) index into `terms` of each DVL sample's correction.
+    epoch_ns: stamp of the recording's time 0.
+    heading: see `Estimate.heading_deviation`.
+    slow, beam: None if not estimated.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
@@ -199,9 +203,10 @@ def dead_reckoned(
 class _Level(NamedTuple):
     """Reference velocity and DVL error of N samples.
 
-    velocity, error: (N, 4) m/s, forward, port, east, north, the latter two where oriented (N,). yaw: (N,) rad. in_body:
-    (N, 3) m/s, error. whole: if requested, rotation_enu_from_body (N, 3, 3), velocity and error (N, 3) m/s, rates
-    (N, 3) rad/s, body axes.
+    velocity, error: (N, 4) m/s, forward, port, east, north, the latter two where oriented (N,).
+    yaw: (N,) rad.
+    in_body: (N, 3) m/s, error.
+    whole: if requested, rotation_enu_from_body (N, 3, 3), velocity and error (N, 3) m/s, rates (N, 3) rad/s, body axes.
     """
 
     velocity: Array
@@ -272,7 +277,9 @@ def drift_over(error_of_track: Array, distance: Array, ends: Index) -> Drift:
 def _noise(errors: Array, step_s: Array, distance: Array, ends: Index, slow: SlowNoise | None) -> float:
     """Return the drift by white and slow noise, m per km, rms over stretches.
 
-    errors: (K, 2) m/s; differences of neighbours give the white noise. step_s: (K,) s. distance: (K,) m driven.
+    errors: (K, 2) m/s; differences of neighbours give the white noise.
+    step_s: (K,) s.
+    distance: (K,) m driven.
     ends: (S + 1,) indices of the ends of stretches.
     """
     if len(errors) < 3:

@@ -34,9 +34,10 @@ _COMPASS = (("north", 0.0), ("east", 90.0), ("south", 180.0), ("west", 270.0))
 class RecentMotion(NamedTuple):
     """Motion of the vehicle.
 
-    speed: m/s. heading: rad, counterclockwise from east; None if unknown. in_earth: whether the reference is in an
-    earth frame, so that its constant error rotates relative to the vehicle. noise: (m/s)² per axis, of one second of
-    reference and DVL.
+    speed: m/s.
+    heading: rad, counterclockwise from east; None if unknown.
+    in_earth: whether the reference is in an earth frame, so that its constant error rotates relative to the vehicle.
+    noise: (m/s)² per axis, of one second of reference and DVL.
     """
 
     speed: float

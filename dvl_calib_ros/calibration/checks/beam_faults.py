@@ -53,8 +53,9 @@ def effect_velocities(v: Array) -> Array:
 class BeamFault(NamedTuple):
     """Most significant beam.
 
-    share, std: missing share of its velocity, and σ. azimuth_deg: of the beam, from the DVL's x axis to port. off:
-    resulting error of the mean velocity, as a share of the speed.
+    share, std: missing share of its velocity, and σ.
+    azimuth_deg: of the beam, from the DVL's x axis to port.
+    off: resulting error of the mean velocity, as a share of the speed.
     """
 
     share: float

@@ -73,9 +73,10 @@ class AttitudeRates:
     def add(self, times: Array, orientation: Array, angular_velocity: Array, begins: Sequence[int] = (0,)) -> None:
         """Add the next samples in order of time.
 
-        times: (M,) s. orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``. angular_velocity: (M, 3)
-        rad/s, body. Both nan if not known. begins: indices of the first samples of stretches that are differentiated
-        separately.
+        times: (M,) s.
+        orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``.
+        angular_velocity: (M, 3) rad/s, body. Both nan if not known.
+        begins: indices of the first samples of stretches that are differentiated separately.
         """
         known = ~(np.isnan(orientation[:, 0]) | np.isnan(angular_velocity).any(axis=1))
         bounds = [*begins, len(times)]

@@ -83,12 +83,16 @@ class ResidualTrend(NamedTuple):
     """Signals that the residual velocity follows.
 
     tilt, tilt_std: (2,) share of roll and pitch missing in the DVL's velocity: 0 if correct, 1 if levelled, ±2 for a
-    wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
-    of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
-    circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: the most significant
-    of `FILTER_MEMORIES_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
-    heading; 0 if the residual holds less than half of it. turned, turned_std: rad, change of the heading error from
-    start to end.
+      wrong sign.
+    bias, bias_std: (3,) m/s, of the DVL, body.
+    smoothed, smoothed_std: s², half the squared time constant of the reference; negative for the DVL.
+    lean: (2,) rad, mean roll and pitch.
+    speed: m/s, rms.
+    circular, circular_std: share of the DVL's noise that the reference keeps after one sample.
+    circular_s: the most significant of `FILTER_MEMORIES_S`.
+    over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every heading; 0 if the residual
+      holds less than half of it.
+    turned, turned_std: rad, change of the heading error from start to end.
     """
 
     tilt: Array
@@ -342,9 +346,10 @@ def residual_warnings(
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
-    of_positions: the reference's velocities are position differences, smoothed by their interval. mounting_std: see
-    `confused_with_bias_std`. accepted: error of the mounting (rad, or share of the distance) that does not reject a
-    calibration; nor does an error within its own 95 % interval.
+    of_positions: the reference's velocities are position differences, smoothed by their interval.
+    mounting_std: see `confused_with_bias_std`.
+    accepted: error of the mounting (rad, or share of the distance) that does not reject a calibration; nor does an
+      error within its own 95 % interval.
     second_order: square of the misalignment, rad²: the error of its first-order model, which looks like a beam.
     """
     if found is None:

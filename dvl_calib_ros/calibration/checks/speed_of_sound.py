@@ -56,8 +56,12 @@ class Between(NamedTuple):
 class Water:
     """Water properties from a recording, nan if not recorded.
 
-    temperature: °C. temperature_error: half of its range, °C. salinity: PSU, measured. depth: m. used: speed of sound
-    set in the DVL, m/s. source: topic of the temperature.
+    temperature: °C.
+    temperature_error: half of its range, °C.
+    salinity: PSU, measured.
+    depth: m.
+    used: speed of sound set in the DVL, m/s.
+    source: topic of the temperature.
     """
 
     temperature: float = math.nan
@@ -124,8 +128,9 @@ def water_of_document(document: Mapping[str, Any]) -> Water:
 class CauseOfScale(NamedTuple):
     """Cause of a scale error.
 
-    sentence: in full. brief: one terminal line after the words "speed of sound". setting: speed of sound to set, m/s;
-    nan without a recommendation.
+    sentence: in full.
+    brief: one terminal line after the words "speed of sound".
+    setting: speed of sound to set, m/s; nan without a recommendation.
     """
 
     sentence: str

@@ -28,9 +28,13 @@ LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 class Cleaned(NamedTuple):
     """Samples of a block, without outliers.
 
-    raw: its references (J,) from the messages, thinned. reference: without outliers, with their stamps reference_ns.
-    dvl: without outliers. binned_dvl: for interpolation. noise_dvl: (3, 3) (m/s)², mean covariance. reference_spikes,
-    dvl_spikes: number of outliers within the block. own_dvl, own_imu: the block's own samples, without margins.
+    raw: its references (J,) from the messages, thinned.
+    reference: without outliers, with their stamps reference_ns.
+    dvl: without outliers.
+    binned_dvl: for interpolation.
+    noise_dvl: (3, 3) (m/s)², mean covariance.
+    reference_spikes, dvl_spikes: number of outliers within the block.
+    own_dvl, own_imu: the block's own samples, without margins.
     are_compared: whether it has references and DVL data for them; else DVL and IMU are empty.
     """
 

@@ -47,10 +47,12 @@ FEWEST_DVL = 6
 class Outcome(NamedTuple):
     """Results after a block.
 
-    days: states (20,) of `full` on each day; empty without an estimate. counts: samples used, outliers (spikes and
-    rejected residuals), and mean squared residual. claims: references with their own noise, minus those without.
-    has_rows: whether any reference has been used. looked: latest registration. suggestion: live, the configuration that
-    fits by it.
+    days: states (20,) of `full` on each day; empty without an estimate.
+    counts: samples used, outliers (spikes and rejected residuals), and mean squared residual.
+    claims: references with their own noise, minus those without.
+    has_rows: whether any reference has been used.
+    looked: latest registration.
+    suggestion: live, the configuration that fits by it.
     """
 
     days: tuple[GaussianState, ...]
@@ -72,8 +74,9 @@ class BlockSolver:
     ) -> None:
         """Start from priors; `FullEstimator` sets `epoch_ns`, the stamp of time 0.
 
-        prior: x, P of the states. unknown: prior of the per-day states on further days. live: repeat the registration
-        during the run.
+        prior: x, P of the states.
+        unknown: prior of the per-day states on further days.
+        live: repeat the registration during the run.
         """
         self._parameters = parameters
         self.fit = JointFit(parameters, prior, unknown)

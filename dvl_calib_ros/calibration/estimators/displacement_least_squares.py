@@ -257,8 +257,11 @@ def _hypotheses(blocks: _Blocks) -> Array:
 class _NormalEquations(NamedTuple):
     """Sums of squares and products over all blocks and axes, for G noise covariances and a white variance of 1.
 
-    square: (G,) of y. vector: (G, 13) of y and the columns. information: (G, 13, 13) of the columns. log_det: (G,) log
-    determinant of the noise covariance of all axes. freedom: degrees of freedom.
+    square: (G,) of y.
+    vector: (G, 13) of y and the columns.
+    information: (G, 13, 13) of the columns.
+    log_det: (G,) log determinant of the noise covariance of all axes.
+    freedom: degrees of freedom.
     """
 
     square: Array
@@ -352,7 +355,9 @@ SHORTEST_FIX_NS = 950_000_000
 class Fixes(NamedTuple):
     """N position fixes in order of stamps.
 
-    stamps_ns: (N,). position: (N, 3) east, north, up, m, from any origin. variance: (N, 3) m², nan if not given.
+    stamps_ns: (N,).
+    position: (N, 3) east, north, up, m, from any origin.
+    variance: (N, 3) m², nan if not given.
     """
 
     stamps_ns: Stamps
@@ -378,10 +383,13 @@ class Fixes(NamedTuple):
 class Legs(NamedTuple):
     """N fixes, each with the dead reckoning to it since its stretch began. A stretch has no DVL gap.
 
-    seconds: (N,) since the first DVL sample. stretch: (N,) number. way: (N, 3, 3, 3) m, W = ∫ R ⊗ v dt over axes of
-    ENU, body and DVL; the displacement for a correction matrix M is W : M. drifted: (N, 3, 5) m/rad, derivative of the
-    displacement by the heading deviation, the drift being per second. rotation: (N, 3, 3) ENU from body. velocity:
-    (N, 3) m/s ENU, nominal mounting. position, variance: (N, 3) of the fixes.
+    seconds: (N,) since the first DVL sample.
+    stretch: (N,) number.
+    way: (N, 3, 3, 3) m, W = ∫ R ⊗ v dt over axes of ENU, body and DVL; a correction matrix M displaces by W : M.
+    drifted: (N, 3, 5) m/rad, derivative of the displacement by the heading deviation, the drift being per second.
+    rotation: (N, 3, 3) ENU from body.
+    velocity: (N, 3) m/s ENU, nominal mounting.
+    position, variance: (N, 3) of the fixes.
     """
 
     seconds: Array

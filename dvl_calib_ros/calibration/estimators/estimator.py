@@ -43,10 +43,11 @@ SOLVED_WITHIN_NS = 1_000_000_000
 class EstimatorSetup:
     """Arguments for making an estimator.
 
-    initial: initial state of the model. on_evidence: called when a result takes effect, with the stamp of the first DVL
-    sample that it may affect. verified: keep what hold-out verification needs. worker: runs slow work in order, in
-    one thread, so that live messages do not wait; None runs it immediately. together: number of blocks gathered before
-    they are solved, unless a result is requested.
+    initial: initial state of the model.
+    on_evidence: called when a result takes effect, with the stamp of the first DVL sample that it may affect.
+    verified: keep what hold-out verification needs.
+    worker: runs slow work in order, in one thread, so that live messages do not wait; None runs it immediately.
+    together: number of blocks gathered before they are solved, unless a result is requested.
     """
 
     model: Model
@@ -334,9 +335,11 @@ class AtOnce(Executor):
 class Residuals(NamedTuple):
     """Residuals of a calibration.
 
-    held_out: velocity error on held-out data. typical: m/s rms with the state from all data, without outliers; None
-    without any. judged: samples and velocity products, see `calibration_error`. navigation: held-out drift of dead
-    reckoning, with heading deviation. in_earth: whether the reference is in an earth frame.
+    held_out: velocity error on held-out data.
+    typical: m/s rms with the state from all data, without outliers; None without any.
+    judged: samples and velocity products, see `calibration_error`.
+    navigation: held-out drift of dead reckoning, with heading deviation.
+    in_earth: whether the reference is in an earth frame.
     """
 
     held_out: HeldOutError | None

@@ -67,8 +67,10 @@ _UNIT_POINTS: Array = normal_points(5, N_POINTS)
 class _Section(NamedTuple):
     """Interval between two knots.
 
-    seconds: length. gram: of its rows, None without rows. fold: hold-out fold. up: (21,) mean of `PredictedRows.up`,
-    its velocity at zero states; None without attitude or vertical reference.
+    seconds: length.
+    gram: of its rows, None without rows.
+    fold: hold-out fold.
+    up: (21,) mean of `PredictedRows.up`, its velocity at zero states; None without attitude or vertical reference.
     """
 
     seconds: float
@@ -81,10 +83,13 @@ class _Section(NamedTuple):
 class _Day:
     """Blocks of one day (recordings with one DVL delay), and their normal equations about the point of linearisation.
 
-    count: number of blocks so far. sections: of the blocks whose streams are kept. before: chains of older blocks, with
-    all sections and without each fold. chain: of all blocks. white: (3,) variance of a bin of weight one. single: (3,)
-    variance of a row about its section's median. level, level_std: (3,) m/s, median and scatter of the sections'
-    medians.
+    count: number of blocks so far.
+    sections: of the blocks whose streams are kept.
+    before: chains of older blocks, with all sections and without each fold.
+    chain: of all blocks.
+    white: (3,) variance of a bin of weight one.
+    single: (3,) variance of a row about its section's median.
+    level, level_std: (3,) m/s, median and scatter of the sections' medians.
     """
 
     blocks: list[FitBlock] = field(default_factory=list)
@@ -122,8 +127,9 @@ class _PriorInformation(NamedTuple):
 class _Climb(NamedTuple):
     """Mean velocity upwards of a day by its DVL.
 
-    at: (20,) indices of its states. row: (21,) derivatives by these, and m/s at zero states. std: m/s, of a vehicle
-    that is level.
+    at: (20,) indices of its states.
+    row: (21,) derivatives by these, and m/s at zero states.
+    std: m/s, of a vehicle that is level.
     """
 
     at: Index
@@ -134,7 +140,8 @@ class _Climb(NamedTuple):
 class _Hypotheses(NamedTuple):
     """A combinations of priors and B paths of the vehicle, at C points of the slow errors, over n states.
 
-    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C). log_odds: (A, B).
+    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C).
+    log_odds: (A, B).
     climb_mps: (B,) m/s, σ of a day's mean climb.
     """
 

@@ -53,9 +53,11 @@ GAP_INTERVALS, GAP_S = 3.0, 1.2
 class FitBlock:
     """All streams of a block of time; DVL and IMU extend beyond it for delays up to LONGEST_DELAY_S.
 
-    from_s, end_s: the block's limits. slope: (N, 3) m/s², of the DVL's spline at its samples. imu_slope: (M, 7) per s,
-    of the IMU's quaternion (of continuous sign) and angular velocity. measured: (J, 3) whether a reference measures
-    each axis of its own frame. fold: (J,) hold-out fold of each reference.
+    from_s, end_s: the block's limits.
+    slope: (N, 3) m/s², of the DVL's spline at its samples.
+    imu_slope: (M, 7) per s, of the IMU's quaternion (of continuous sign) and angular velocity.
+    measured: (J, 3) whether a reference measures each axis of its own frame.
+    fold: (J,) hold-out fold of each reference.
     """
 
     from_s: float
@@ -104,10 +106,15 @@ class FitBlock:
 class PredictedRows(NamedTuple):
     """Residuals and derivatives of J references about a state.
 
-    times: (J,) s. residual: (J, 3) m/s. columns: (J, 3, 20) derivatives of the prediction by the states. slow:
-    (J, 3, 6) by the slow errors. weight: (J, 3) per axis. fold: (J,). up: (J, 21) derivatives of the DVL's velocity
-    upwards by the states, and that velocity (m/s); 0 without attitude. oriented: (J,) whether it has attitude. dvl:
-    (J, 3) m/s, mean of the DVL's velocities before and after, whose noise is not in the residual.
+    times: (J,) s.
+    residual: (J, 3) m/s.
+    columns: (J, 3, 20) derivatives of the prediction by the states.
+    slow: (J, 3, 6) by the slow errors.
+    weight: (J, 3) per axis.
+    fold: (J,).
+    up: (J, 21) derivatives of the DVL's velocity upwards by the states, and that velocity (m/s); 0 without attitude.
+    oriented: (J,) whether it has attitude.
+    dvl: (J, 3) m/s, mean of the DVL's velocities before and after, whose noise is not in the residual.
     """
 
     times: Array
@@ -156,8 +163,9 @@ def spline_slopes(times: Array, values: Array) -> Array:
 class AttitudeAt(NamedTuple):
     """Attitude ``rotation_enu_from_body`` (J, 3, 3), identity without one, and turn rates at J times.
 
-    oriented: (J,) where the attitude is known. rates: (J, 3) rad/s, and their derivative `turning` (J, 3) rad/s², body
-    axes; rates_known: (J,).
+    oriented: (J,) where the attitude is known.
+    rates: (J, 3) rad/s, and their derivative `turning` (J, 3) rad/s², body axes.
+    rates_known: (J,).
     """
 
     rotation: Array
@@ -267,8 +275,9 @@ def joined_blocks(blocks: Sequence[FitBlock]) -> Iterator[tuple[list[int], Joine
 class _AtReferences(NamedTuple):
     """Streams at the delayed times of the J usable references of joined blocks.
 
-    used: (J,) their indices. turns: (J, 1) 0 for a reference in body axes, else 1. velocity, earlier, later: (J, 3) m/s
-    of the DVL, its frame, then, and `reach` (J,) s before and after.
+    used: (J,) their indices.
+    turns: (J, 1) 0 for a reference in body axes, else 1.
+    velocity, earlier, later: (J, 3) m/s of the DVL, its frame, then, and `reach` (J,) s before and after.
     """
 
     used: Index

@@ -74,7 +74,9 @@ def effects_gram(
 ) -> Array:
     """Return the Gram matrix (21 + k, 21 + k) of a section over [states, effects, residual], without slow errors.
 
-    velocities: see `SectionRows.with_effects`. x: (20,) point of linearisation. single, white: (3,) variances.
+    velocities: see `SectionRows.with_effects`.
+    x: (20,) point of linearisation.
+    single, white: (3,) variances.
     """
     bins = part.with_effects(velocities).bins(single)
     k = bins.rows.shape[2] - WIDTH

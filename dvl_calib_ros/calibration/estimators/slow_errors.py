@@ -57,8 +57,10 @@ class LogNormal(NamedTuple):
 class Priors:
     """Priors of the slow errors, from instrument specifications.
 
-    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: AHRS, rad.
-    memory: 10 to 300 s (90 %). deviation: heading deviation as a share of `heading_deviation_std`.
+    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s.
+    heading, tilt: AHRS, rad.
+    memory: 10 to 300 s (90 %).
+    deviation: heading deviation as a share of `heading_deviation_std`.
     """
 
     horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
@@ -86,7 +88,9 @@ def normal_points(k: int, n: int) -> Array:
 class Bins(NamedTuple):
     """Rows of one section averaged over bins of time.
 
-    rows: (J, 3, WIDTH), [slow at start, slow at end, states, residual]. weight: (J, 3). fold: (J,).
+    rows: (J, 3, WIDTH), [slow at start, slow at end, states, residual].
+    weight: (J, 3).
+    fold: (J,).
     """
 
     rows: Array

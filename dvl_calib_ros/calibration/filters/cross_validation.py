@@ -148,9 +148,10 @@ def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np
 class MomentSums(NamedTuple):
     """Sums over samples with a reference that suffice to judge any correction.
 
-    samples: their number. vv (3, 3, 3), gv (3, 3): for each body axis, over samples whose reference measures it, Σ v vᵀ
-    and Σ g vᵀ. gg, noise: over all axes, Σ g² and Σ of the variance of R. v (3,) m/s is measured, DVL frame, at the
-    reference point; g m/s is the reference velocity along the axis.
+    samples: their number.
+    vv (3, 3, 3), gv (3, 3): for each body axis, over samples whose reference measures it, Σ v vᵀ and Σ g vᵀ.
+    gg, noise: over all axes, Σ g² and Σ of the variance of R. v (3,) m/s is measured, DVL frame, at the reference
+      point; g m/s is the reference velocity along the axis.
     """
 
     samples: Array | float
@@ -201,12 +202,15 @@ class Moments(FoldSums):
 class HeldOutError:
     """Velocity error against the reference on held-out samples, m/s rms over the vector.
 
-    uncorrected: nominal mounting. corrected: estimate. predicted: expected value of corrected by R of the reference and
-    the covariance of the estimate. All include reference noise. calibration: contribution of the estimate to predicted.
+    uncorrected: nominal mounting.
+    corrected: estimate.
+    predicted: expected value of corrected by R of the reference and the covariance of the estimate. All include
+      reference noise.
+    calibration: contribution of the estimate to predicted.
     interpolated: white reference noise that corrected may contain beyond uncorrected: interpolation attenuates noise
-    between samples, and a delay changes the interpolation times. independent: equivalent number of independent samples;
-    None: samples. claimed: noise of reference and DVL by their messages, if predicted uses the noise estimated from the
-    data.
+      between samples, and a delay changes the interpolation times.
+    independent: equivalent number of independent samples; None: samples.
+    claimed: noise of reference and DVL by their messages, if predicted uses the noise estimated from the data.
     """
 
     samples: int

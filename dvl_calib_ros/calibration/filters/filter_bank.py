@@ -101,8 +101,11 @@ def groups_of(
 class Group:
     """K models with equal observations that differ in z and H only.
 
-    needs: common to all. index: number k by name. n_given: samples received. next_row: for the caller, number of the
-    first row not yet passed. moments: of the samples, for the verification of models with a reference; else empty.
+    needs: common to all.
+    index: number k by name.
+    n_given: samples received.
+    next_row: for the caller, number of the first row not yet passed.
+    moments: of the samples, for the verification of models with a reference; else empty.
     """
 
     def __init__(

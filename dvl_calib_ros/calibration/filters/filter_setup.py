@@ -20,9 +20,9 @@ from ..numerics.tests import chi2_cdf, chi2_isf
 class Assembler:
     """Measurements and states of K models with equal size and noise that differ in z and H only.
 
-    start: initial x (K, n), P (K, n, n): the prior, or `initial` by model name. prior: of all models (also used for
-    states that differ per recording). process_rate: Q per second (K, n, n), a random walk of misalignment and scale,
-    not of nuisance states; None without.
+    start: initial x (K, n), P (K, n, n): the prior, or `initial` by model name.
+    prior: of all models (also used for states that differ per recording).
+    process_rate: Q per second (K, n, n), a random walk of misalignment and scale, not of nuisance states; None without.
     """
 
     def __init__(

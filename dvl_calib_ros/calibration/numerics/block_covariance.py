@@ -37,7 +37,9 @@ MIN_LASTING_BLOCKS, LASTING_Z, MAX_CORRELATION = 16, 1.5, 0.85
 class TimeBlocks:
     """Information of consecutive time blocks, for K hypotheses or models.
 
-    count: number of blocks. weight: equivalent number of samples. total: sums Λ (K, n, n) and y (K, n), read-only.
+    count: number of blocks.
+    weight: equivalent number of samples.
+    total: sums Λ (K, n, n) and y (K, n), read-only.
     """
 
     def __init__(self) -> None:
@@ -80,8 +82,9 @@ class TimeBlocks:
     def end_day(self, of_day: NDArray[np.intp], information: Array, vector: Array, source: NDArray[np.intp]) -> None:
         """Reduce the blocks to the states that continue in the next recording.
 
-        of_day: indices (u,) of the other states. information (K, n, n), vector (K, n): total. source: (K,) index of the
-        hypothesis whose past each one takes.
+        of_day: indices (u,) of the other states.
+        information (K, n, n), vector (K, n): total.
+        source: (K,) index of the hypothesis whose past each one takes.
         """
         if not len(of_day):
             return

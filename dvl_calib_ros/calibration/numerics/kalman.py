@@ -68,9 +68,12 @@ def covariance_of(information: Array, prior: Array) -> Array:
 class Measurements:
     """N measurements of m rows for each of K models with n states.
 
-    z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N),
-    information weight of a sample, in 0..1 (below 1 for samples that share noise). usable: (K, N), False where a model
-    must not use a sample. gate: (K or 1, N or 1), largest accepted normalised innovation squared, inf without gate.
+    z: (K, N, m).
+    h: (K, N, m, n).
+    r: (K or 1, N or 1, m, m), symmetric positive definite.
+    weight: (K or 1, N), information weight of a sample, in 0..1 (below 1 for samples that share noise).
+    usable: (K, N), False where a model must not use a sample.
+    gate: (K or 1, N or 1), largest accepted normalised innovation squared, inf without gate.
     """
 
     z: Array
@@ -106,9 +109,10 @@ class Measurements:
 class Updated:
     """State after a block of measurements.
 
-    x: (K, n), p: (K, n, n) after the last sample. used: (K, N). nis: (K, N) normalised innovation squared νᵀS⁻¹ν of
-    usable samples against the state before them, else 0. at: x (E, K, n), P (E, K, n, n) after the requested numbers of
-    samples, if any.
+    x: (K, n), p: (K, n, n) after the last sample.
+    used: (K, N).
+    nis: (K, N) normalised innovation squared νᵀS⁻¹ν of usable samples against the state before them, else 0.
+    at: x (E, K, n), P (E, K, n, n) after the requested numbers of samples, if any.
     """
 
     x: Array
@@ -133,9 +137,11 @@ def recursion(
 ) -> Updated:
     """Filter N samples in sequence.
 
-    x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q added before each sample, or None. ends: (E,) ascending
-    numbers of samples (0..N) after which the state is returned, too. Raises LinAlgError if S is not positive definite,
-    or a number is not finite.
+    x: (K, n).
+    p: (K, n, n).
+    process: (N, K, n, n) covariance Q added before each sample, or None.
+    ends: (E,) ascending numbers of samples (0..N) after which the state is returned, too. Raises LinAlgError if S is
+      not positive definite, or a number is not finite.
     """
     # per model: products of single matrices cost a third of those of stacks, and a live block has one sample
     models = [

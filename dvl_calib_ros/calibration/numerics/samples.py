@@ -136,11 +136,14 @@ class Covariances:
 class SampleBlock:
     """Columns of one stream: N messages in order of arrival.
 
-    stamps_ns: (N,) of the header. values: (N, 3) velocity, m/s, in the DVL frame or the frame of `frames`; for the IMU
-    (N, 7), unit quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body frame, nan
-    where missing. covariances: of velocities. frames: (N,) of the reference, indices in `FRAMES`. refused: (N,) 0 for a
-    sample, else 1 + index in `reasons` of the reason (wrong frame, no bottom lock, undecodable ...); other columns of
-    such a row are undefined. arrival: (N,) strictly increasing, the order of arrival over all streams.
+    stamps_ns: (N,) of the header.
+    values: (N, 3) velocity, m/s, in the DVL frame or the frame of `frames`; for the IMU (N, 7), unit quaternion (x, y,
+      z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body frame, nan where missing.
+    covariances: of velocities.
+    frames: (N,) of the reference, indices in `FRAMES`.
+    refused: (N,) 0 for a sample, else 1 + index in `reasons` of the reason (wrong frame, no bottom lock, undecodable
+      ...); other columns of such a row are undefined.
+    arrival: (N,) strictly increasing, the order of arrival over all streams.
     """
 
     stream: Stream
@@ -242,8 +245,9 @@ def sample_block(
 ) -> SampleBlock:
     """Return a `SampleBlock`; values common to all rows may be given once.
 
-    covariance: (3, 3) or (N, 3, 3) (m/s)², None if not given. frames: one, or (N,) indices in `FRAMES`. arrival:
-    default is row order, valid for a single stream only.
+    covariance: (3, 3) or (N, 3, 3) (m/s)², None if not given.
+    frames: one, or (N,) indices in `FRAMES`.
+    arrival: default is row order, valid for a single stream only.
     """
     n = len(stamps_ns)
     if not isinstance(covariance, Covariances):
@@ -324,14 +328,20 @@ class Pairing:
 class AlignedBlock:
     """N DVL samples in order of stamps, with the other streams interpolated at their times.
 
-    stamps_ns: (N,) corrected for dvl_time_offset. row: (N,) number of the DVL message since the start, from 0.
-    velocity_dvl: (N, 3) m/s, DVL frame. covariance: (N, 3, 3) (m/s)² of it, nan where not given. interval_ns: (N,)
-    since the previous sample, 0 for the first. verdict: (N,) see `SampleUse`. prior_known: (N,) prior sway and heave
-    were known. attitude: (N, 7) quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body
-    frame; nan where unknown. pairing: (N,) see `Pairing`. reference: (N, 12) velocity (3), m/s, and covariance (9, nan
-    where not given), in the frame of frames: (N,) indices in `FRAMES`; nan where unpaired. unmeasured: (N,) a bit (1,
-    2, 4) per axis of that frame that the reference does not measure. weight: (N,) information weight of the reference,
-    below 1 where neighbours share its samples.
+    stamps_ns: (N,) corrected for dvl_time_offset.
+    row: (N,) number of the DVL message since the start, from 0.
+    velocity_dvl: (N, 3) m/s, DVL frame.
+    covariance: (N, 3, 3) (m/s)² of it, nan where not given.
+    interval_ns: (N,) since the previous sample, 0 for the first.
+    verdict: (N,) see `SampleUse`.
+    prior_known: (N,) prior sway and heave were known.
+    attitude: (N, 7) quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body frame; nan
+      where unknown.
+    pairing: (N,) see `Pairing`.
+    reference: (N, 12) velocity (3), m/s, and covariance (9, nan where not given), in the frame of frames: (N,) indices
+      in `FRAMES`; nan where unpaired.
+    unmeasured: (N,) a bit (1, 2, 4) per axis of that frame that the reference does not measure.
+    weight: (N,) information weight of the reference, below 1 where neighbours share its samples.
     """
 
     stamps_ns: Stamps

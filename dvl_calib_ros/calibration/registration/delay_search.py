@@ -124,7 +124,9 @@ def _spectra(series: _Series, size: int) -> Array:
 class _LagSums(NamedTuple):
     """Sums over the overlap of body and DVL series at each lag (L,).
 
-    n_steps: number of steps. squares: Σ|B|² + Σ|v|². correlation: tr(C Σ v Bᵀ).
+    n_steps: number of steps.
+    squares: Σ|B|² + Σ|v|².
+    correlation: tr(C Σ v Bᵀ).
     """
 
     n_steps: Array

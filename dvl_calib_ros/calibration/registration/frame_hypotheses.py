@@ -71,7 +71,9 @@ READ_BY: Mapping[str, Array] = {
 class ImuFrame:
     """Hypothesis about the IMU's axes and world.
 
-    rotation_body_from_imu (3, 3); world: as parameter imu_frame; says: description. heading_offset: rad, as parameter.
+    rotation_body_from_imu (3, 3); world: as parameter imu_frame;
+    says: description.
+    heading_offset: rad, as parameter.
     """
 
     rotation_body_from_imu: Array
@@ -111,8 +113,10 @@ class Reading:
 class Agreement:
     """Agreement of DVL and reference under one reading.
 
-    residual: RMS as a share of the speed, with the given mounting or else the best one. rotation_dvl_from_body:
-    (3, 3) best rotation; best_residual: its residual. is_ahead: the vehicle mostly moves ahead or astern, not sideways.
+    residual: RMS as a share of the speed, with the given mounting or else the best one.
+    rotation_dvl_from_body: (3, 3) best rotation.
+    best_residual: its residual.
+    is_ahead: the vehicle mostly moves ahead or astern, not sideways.
     """
 
     reading: Reading
@@ -130,8 +134,9 @@ class Agreement:
 class Registered(NamedTuple):
     """Registration of a reading.
 
-    residual: as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, lever arm beyond the
-    configured one, and its σ.
+    residual: as a share of the speed.
+    rotation_dvl_from_body: (3, 3).
+    arm, arm_std: (3,) m, lever arm beyond the configured one, and its σ.
     """
 
     residual: float

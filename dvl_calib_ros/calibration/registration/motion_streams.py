@@ -39,9 +39,12 @@ from ..streams.stream_order import strays
 class MotionStreams:
     """Streams of one vehicle with increasing stamps.
 
-    dvl: velocity in the DVL frame. reference_times (M,) s, reference (M, 3) m/s: ENU if in_earth, else body frame.
-    measured: (3,) measured axes of the reference. imu: attitudes, may be missing. turns: angular rates. epoch_ns: stamp
-    of time 0, before corrections.
+    dvl: velocity in the DVL frame.
+    reference_times (M,) s, reference (M, 3) m/s: ENU if in_earth, else body frame.
+    measured: (3,) measured axes of the reference.
+    imu: attitudes, may be missing.
+    turns: angular rates.
+    epoch_ns: stamp of time 0, before corrections.
     """
 
     dvl: DvlColumns

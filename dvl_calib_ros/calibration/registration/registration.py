@@ -86,16 +86,24 @@ class Clock:
 class Registration:
     """Delays, mounting, lever arm and scale of one motion.
 
-    dvl, reference: clocks relative to the IMU. imu: its own clock, if it alone is off. apart: delay of the DVL relative
-    to the reference. is_turned: an attitude rotates the reference; without it the delayed clock is not identifiable,
-    and the reference is assumed synchronised. are_known: the data determine the delays.
+    dvl, reference: clocks relative to the IMU.
+    imu: its own clock, if it alone is off.
+    apart: delay of the DVL relative to the reference.
+    is_turned: an attitude rotates the reference; without it the delayed clock is not identifiable, and the reference is
+      assumed synchronised.
+    are_known: the data determine the delays.
 
-    rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: DVL from the reference point,
-    body frame. scale, scale_std: DVL scale error, dimensionless. residual: as a share of the speed; spread:
-    residual per axis, m/s; speed: RMS, m/s. unsteady: clock drift or step; all other fields hold after its correction.
+    rotation_body_from_dvl (3, 3), turn_std (3,) rad.
+    lever_arm, lever_arm_std (3,) m: DVL from the reference point, body frame.
+    scale, scale_std: DVL scale error, dimensionless.
+    residual: as a share of the speed.
+    spread: residual per axis, m/s.
+    speed: RMS, m/s.
+    unsteady: clock drift or step; all other fields hold after its correction.
 
-    open_std_s: σ (s) of the reference delay from the data alone. open_by: (7,) derivatives of the DVL's rotation (rad,
-    body), lever arm (m) and DVL delay (s) with respect to it. next_worse: chi-square margin to the next explanation.
+    open_std_s: σ (s) of the reference delay from the data alone.
+    open_by: (7,) derivatives of the DVL's rotation (rad, body), lever arm (m) and DVL delay (s) with respect to it.
+    next_worse: chi-square margin to the next explanation.
     """
 
     dvl: Clock
@@ -386,7 +394,9 @@ def _fit_in_sync(
 ) -> _HeldFit:
     """Fit with some or all clocks synchronised, and compare with the fit `free`.
 
-    rho, delta: initial delays, s. held_clocks: rows that select the synchronised clocks. penalty: chi-square added.
+    rho, delta: initial delays, s.
+    held_clocks: rows that select the synchronised clocks.
+    penalty: chi-square added.
     """
     held = fit(rho, delta, rotation, held_clocks)
     if held is None or not _is_possible(held):

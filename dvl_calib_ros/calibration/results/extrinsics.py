@@ -120,7 +120,8 @@ def extrinsics_of(
     """Return the extrinsics of a model state (n,), estimated with these parameters.
 
     state: with the σ of its recording. A component is observable if its σ without bias is at most half of its prior σ.
-    span_ns: stamps of the first and last sample. by_bias: (n, 3), `BiasCovariance.columns` of the state.
+    span_ns: stamps of the first and last sample.
+    by_bias: (n, 3), `BiasCovariance.columns` of the state.
     """
     others = scale_and_delay(model, state, parameters)
     value = np.array(

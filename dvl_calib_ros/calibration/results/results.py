@@ -92,14 +92,18 @@ class BiasCovariance(NamedTuple):
 class Estimate:
     """State of one model.
 
-    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors, then nuisance states. covariance: (n,
-    n), for the next recording. recording_covariance: (n, n), for this one, inflated by the scatter of time blocks.
-    filter_covariance: (n, n), of the filter alone. left_open: (n, n), contribution of the reference clock to covariance
-    and recording_covariance; at one speed a delay looks like a lever arm. of_bias: effect of the DVL bias on the state
-    and these covariances, for the mounting, not for velocities at the speeds driven. used, gated: samples. mean_nis:
-    mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter. heading_deviation: x
-    (4,), P (4, 4): coefficients of sine and cosine of the yaw and of twice the yaw, rad; None for models with exact
-    heading.
+    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors, then nuisance states.
+    covariance: (n, n), for the next recording.
+    recording_covariance: (n, n), for this one, inflated by the scatter of time blocks.
+    filter_covariance: (n, n), of the filter alone.
+    left_open: (n, n), contribution of the reference clock to covariance and recording_covariance; at one speed a delay
+      looks like a lever arm.
+    of_bias: effect of the DVL bias on the state and these covariances, for the mounting, not for velocities at the
+      speeds driven.
+    used, gated: samples.
+    mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter.
+    heading_deviation: x (4,), P (4, 4): coefficients of sine and cosine of the yaw and of twice the yaw, rad; None for
+      models with exact heading.
     """
 
     model: str
@@ -231,11 +235,16 @@ class Delay(NamedTuple):
 class Result:
     """Estimates of all models, the selected one, and counts of the data.
 
-    first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
-    `Calibrator.counts`. segments: selected model over time. parameters: as used, plain values. verifications: by model,
-    empty without verification. suggestion: configuration that fits, if the configured one is grossly wrong. days:
-    recordings in order, empty for a single one; days_of: the model of their states. doubts: live warnings with the
-    severity of a replay's verdict. iac_model: final model by the selection of the paper.
+    first_ns, last_ns: stamps of the DVL samples received in order, None before the first.
+    counts: see `Calibrator.counts`.
+    segments: selected model over time.
+    parameters: as used, plain values.
+    verifications: by model, empty without verification.
+    suggestion: configuration that fits, if the configured one is grossly wrong.
+    days: recordings in order, empty for a single one.
+    days_of: the model of their states.
+    doubts: live warnings with the severity of a replay's verdict.
+    iac_model: final model by the selection of the paper.
     """
 
     selected: str
@@ -316,9 +325,10 @@ _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 class MountingPose(NamedTuple):
     """Pose of the DVL frame in the body.
 
-    position: (3,) m in the body, nan if unknown. rotation_body_from_dvl: (3, 3), of the frame of the driver data.
+    position: (3,) m in the body, nan if unknown.
+    rotation_body_from_dvl: (3, 3), of the frame of the driver data.
     covariance: (6, 6) of position (m²) and of small rotations about body axes (rad²), as in
-    geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of components that the model does not estimate.
+      geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of components that the model does not estimate.
     """
 
     position: tuple[float, float, float]

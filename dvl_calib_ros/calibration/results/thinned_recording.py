@@ -89,9 +89,11 @@ NO_TERMS = Terms(np.zeros(6), np.zeros(3), 0.0)
 class Compared(NamedTuple):
     """Comparison of N DVL samples with the reference.
 
-    error (N, 3): reference minus corrected DVL, body, m/s; nan without reference, 0 along unmeasured axes. measured (N,
-    3, 3): projection on the measured axes, body. body (N, 3): reference velocity. rotation_enu_from_body (N, 3, 3),
-    oriented (N,): its validity. rates (N, 3): rad/s.
+    error (N, 3): reference minus corrected DVL, body, m/s; nan without reference, 0 along unmeasured axes.
+    measured (N, 3, 3): projection on the measured axes, body.
+    body (N, 3): reference velocity.
+    rotation_enu_from_body (N, 3, 3), oriented (N,): its validity.
+    rates (N, 3): rad/s.
     """
 
     error: Array

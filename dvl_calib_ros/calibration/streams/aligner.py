@@ -72,8 +72,9 @@ NO_DECISIONS = Decisions(*(np.zeros(0, dtype=kind) for kind in (np.intp, np.intp
 class Events(NamedTuple):
     """The T admitted samples in order of arrival.
 
-    dvl_at, reference_at, imu_at: event index of each sample of a stream. reference_ns, imu_ns: newest stamps after each
-    event (`LONG_AGO_NS`: none). horizon_ns: horizon after each event, see `Aligner.horizon_ns`.
+    dvl_at, reference_at, imu_at: event index of each sample of a stream.
+    reference_ns, imu_ns: newest stamps after each event (`LONG_AGO_NS`: none).
+    horizon_ns: horizon after each event, see `Aligner.horizon_ns`.
     """
 
     arrival: Stamps
@@ -332,7 +333,9 @@ def counted(
     not_oriented (no attitude or no angular velocity) + awaiting_attitude. A model's used + gated (+ samples in its
     prior window) are its input: usable samples; with GNSS the paired ones, with attitude the oriented ones.
 
-    gnss_losses: number of reference outages. restarts: of the calibration; restarted: of single models.
+    gnss_losses: number of reference outages.
+    restarts: of the calibration.
+    restarted: of single models.
     """
     counts = {name: dict(tally) for name, tally in aligner.tally.items()}
     for stream, order in aligner.orders.items():

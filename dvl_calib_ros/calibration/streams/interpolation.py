@@ -208,7 +208,9 @@ def reach_at(spacing: Array, least: float, most: float) -> Array:
 def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     """Fit a quadratic to the samples within `reach` of each time, weighted by (1 - |u|³)³ with u = distance / reach.
 
-    times: (N,) s, increasing. values: (N, c). at, reach: (M,) s, nan for no fit.
+    times: (N,) s, increasing.
+    values: (N, c).
+    at, reach: (M,) s, nan for no fit.
     """
     found = ~np.isnan(reach)
     if not found.any():

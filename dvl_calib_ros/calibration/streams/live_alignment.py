@@ -54,11 +54,14 @@ _NAN_4, _NAN_3 = (math.nan,) * 4, (math.nan,) * 3
 class LiveAlignment:
     """Alignment of three streams; `rows` is the result, `partners` counts the decided rows.
 
-    reference, imu: their recent samples. dropouts: of the DVL. lag_ns: largest lag between streams (in stamps),
-    including a wrong clock. day_rows, day_starts_ns: numbers and stamps of the first rows of new recordings. tally: by
-    stream and for pairing, see `Calibrator.counts`. on_restart: called with the backward step (s; negative: forward) of
-    DVL stamps after a reset. before_clearing: called before a track with a backward clock step is cleared, so that
-    users of its samples can copy them first.
+    reference, imu: their recent samples.
+    dropouts: of the DVL.
+    lag_ns: largest lag between streams (in stamps), including a wrong clock.
+    day_rows, day_starts_ns: numbers and stamps of the first rows of new recordings.
+    tally: by stream and for pairing, see `Calibrator.counts`.
+    on_restart: called with the backward step (s; negative: forward) of DVL stamps after a reset.
+    before_clearing: called before a track with a backward clock step is cleared, so that users of its samples can copy
+      them first.
     """
 
     def __init__(

@@ -32,8 +32,9 @@ def add_count(tally: Counter[str], name: str, count: int) -> None:
 class Pairer:
     """Pairing state of the rows of an aligner.
 
-    n_judged, n_oriented, n_paired: numbers of the first row without decided verdict, attitude or reference. given: by
-    need, number of rows available to models with that need. decided_ns: stamp of the newest row with decided reference.
+    n_judged, n_oriented, n_paired: numbers of the first row without decided verdict, attitude or reference.
+    given: by need, number of rows available to models with that need.
+    decided_ns: stamp of the newest row with decided reference.
     needs_turn_rate: verdicts wait for the angular velocity.
     """
 

@@ -28,8 +28,10 @@ HEADING_HARMONICS = 4
 class Regressor(NamedTuple):
     """What a residual may follow, with its test.
 
-    about: its name, or a period (s). columns: (M, A, c). energy: chi-square of dof under the null, once divided by its
-    inflation in simulated recordings. log_tried: logarithm of the number of alternatives, such as times of an event.
+    about: its name, or a period (s).
+    columns: (M, A, c).
+    energy: chi-square of dof under the null, once divided by its inflation in simulated recordings.
+    log_tried: logarithm of the number of alternatives, such as times of an event.
     left: deviance that inexact interpolation may leave, where no simulated recordings tell.
     """
 

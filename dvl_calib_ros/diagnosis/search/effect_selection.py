@@ -54,7 +54,8 @@ ROBUST_ROUNDS = 3
 class EffectSelection:
     """Selected effects, strongest first, with the fits without (`base`) and with them under the same noise.
 
-    testable: effects with their observable parameters. trade_off: ambiguity of lever arm and clock at one speed.
+    testable: effects with their observable parameters.
+    trade_off: ambiguity of lever arm and clock at one speed.
     changes: by arm parameter, the difference (m) to a fit with another clock that explains the data equally well.
     wider: the hypothesis with effects that slow noise explains equally well.
     """

@@ -48,8 +48,10 @@ GROUP_RESIDUAL_SHARE = 0.02
 class Unexplained:
     """What a residual follows.
 
-    log_p: of the regressor's gain on held-out data, adjusted for its alternatives. about: name of the regressor, or a
-    period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest: (M, A, c), of the regressor.
+    log_p: of the regressor's gain on held-out data, adjusted for its alternatives.
+    about: name of the regressor, or a period (s).
+    columns: (M, A, f), the dictionary; empty if insignificant.
+    clearest: (M, A, c), of the regressor.
     log_tried: logarithm of its alternatives.
     """
 
