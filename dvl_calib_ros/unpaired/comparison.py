@@ -50,7 +50,7 @@ from .stream_comparison import BLOCK, FEWEST_BLOCKS, OUTLIER, Candidate, compare
 # of equal size on both sides, so the scatter between blocks accounts for any distribution of the noise.
 
 # smaller ratios of levels are irrelevant
-WORTH_TELLING = 1.15
+RELEVANT_RATIO = 1.15
 # limit of the tails in standard deviations, below outliers
 TAIL = 3.7
 # smallest share of samples with motion astern to estimate its noise
@@ -80,15 +80,15 @@ class Scatter:
 
 
 def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
-    """Compare all properties observable on both sides."""
+    """Compare the noise of both sides: level per axis, growth with motion, tails, colour."""
     found: list[Candidate | None] = []
     sides = [scatter(log) for log in (vehicle, simulator)]
     if all(sides) and not (vehicle.exact or simulator.exact):
         slopes = [slopes_of(side) for side in sides]
-        scaled = at_one_motion(sides, slopes)
-        found += [_level(scaled[0], scaled[1], axis) for axis in range(3)]
+        of_vehicle, of_simulator = at_one_motion(sides, slopes)
+        found += [_level(of_vehicle, of_simulator, axis) for axis in range(3)]
         found += _growth(slopes)
-        found += [_tails(scaled[0], scaled[1])]
+        found += [_tails(of_vehicle, of_simulator)]
     found.append(_colour(vehicle, simulator))
     return [candidate for candidate in found if candidate is not None]
 
@@ -146,7 +146,7 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     of_reference = [max(recorded.of_reference for recorded in side) for side in (vehicle, simulator)]
     intervals = []
     for levels, reference in zip(blocks, of_reference, strict=True):
-        value, low, high = np.exp(mean_of(levels))
+        value, low, high = np.exp(np.array(mean_of(levels)))
         intervals.append((float(value), float(np.sqrt(max(low**2 - reference**2, 0.0))), float(high)))
     larger = 0 if intervals[0][0] >= intervals[1][0] else 1
     own_levels = [np.asarray(block) for block in blocks]
@@ -157,7 +157,7 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     note = "DVL and reference together" if max(of_reference) > 0.0 else ""
     return Candidate(
         f"level_{'xyz'[axis]}", "m/s", intervals[0], intervals[1], welch(own_levels[0], own_levels[1]),
-        matters=ratio > WORTH_TELLING, note=note,
+        matters=ratio > RELEVANT_RATIO, note=note,
     )  # fmt: skip
 
 
@@ -188,19 +188,10 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
         if not all(name in slope for slope in slopes):
             continue
         (vehicle_slope, vehicle_std), (simulator_slope, simulator_std) = (slope[name] for slope in slopes)
-        is_present = tuple(_is_significant(slope, name) for slope in slopes)
+        vehicle, simulator = around(vehicle_slope, vehicle_std), around(simulator_slope, simulator_std)
+        is_present = _is_significant(slopes[0], name), _is_significant(slopes[1], name)
         p = float(2.0 * norm.sf(abs(vehicle_slope - simulator_slope) / np.hypot(vehicle_std, simulator_std)))
-        found.append(
-            Candidate(
-                f"growth_with_{name}",
-                unit,
-                around(vehicle_slope, vehicle_std),
-                around(simulator_slope, simulator_std),
-                p,
-                (is_present[0], is_present[1]),
-                matters=any(is_present),
-            )
-        )
+        found.append(Candidate(f"growth_with_{name}", unit, vehicle, simulator, p, is_present, any(is_present)))
     return found
 
 
@@ -399,7 +390,7 @@ def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
 
 
 class _Compared:
-    """Union of the effects, fitted to both sides."""
+    """Effects found on either side, fitted to both, with the p-value of equal sizes."""
 
     def __init__(
         self,
@@ -408,23 +399,27 @@ class _Compared:
         renamed: tuple[Mapping[str, str], Mapping[str, str]],
         names: Sequence[str],
     ) -> None:
+        """Fit the effects of both sides. All pairs are (vehicle, simulator).
+
+        renamed: name of an effect in a side's diagnosis -> name under which both sides are compared.
+        names: effects to fit on both sides.
+        """
         self.names = names
         self._selections, self._logs, self._renamed = selections, logs, renamed
         self._fits = tuple(fitted(selection, names) for selection in selections)
-        per_side = [
-            sizes(selection, fit, list(own.values()))
-            for selection, fit, own in zip(selections, self._fits, renamed, strict=True)
+        vehicle, simulator = self._sizes_of_sides = [
+            sizes(selection, fit, list(side_names.values()))
+            for selection, fit, side_names in zip(selections, self._fits, renamed, strict=True)
         ]
-        self._per_side = per_side
         self.sizes: dict[str, tuple[Size, Size]] = {
-            name: (per_side[0][name], per_side[1][name])
+            name: (vehicle[name], simulator[name])
             for name in names
-            if all(name in side for side in per_side) and compared_names(*(side[name] for side in per_side))
+            if name in vehicle and name in simulator and compared_names(vehicle[name], simulator[name])
         }
         self.p = {name: p_alike(*both) for name, both in self.sizes.items()}
 
     def effect(self, name: str, p: float) -> ComparedEffect:
-        """Compare an effect that both sides can be tested for. p: adjusted."""
+        """Compare an effect that both sides can be tested for. p: corrected for multiple tests."""
         vehicle, simulator = self.sizes[name]
         is_present = is_there(vehicle, simulator), is_there(simulator, vehicle)
         status = _status(is_present, p < LEVEL)
@@ -447,7 +442,7 @@ class _Compared:
 
     def untested(self, name: str) -> ComparedEffect:
         """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
-        sizes = [side[name].intervals() if name in side else {} for side in self._per_side]
+        sizes = [side[name].intervals() if name in side else {} for side in self._sizes_of_sides]
         effect = EFFECTS[name]
         needs = f"no common part of it is observable in both logs: {effect.manoeuvre}"
         for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):

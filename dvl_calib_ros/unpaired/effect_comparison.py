@@ -107,9 +107,9 @@ def p_alike(vehicle: Size, simulator: Size) -> float:
     names = compared_names(vehicle, simulator)
     mean, covariance = simulator.mean
     n = len(vehicle.stacked)
-    each, design = np.kron(np.eye(n), vehicle.taking(names)), np.tile(simulator.taking(names), (n, 1))
-    difference = each @ vehicle.stacked.ravel() - design @ mean
-    covariance = each @ vehicle.covariance @ each.T + design @ covariance @ design.T
+    to_names, design = np.kron(np.eye(n), vehicle.taking(names)), np.tile(simulator.taking(names), (n, 1))
+    difference = to_names @ vehicle.stacked.ravel() - design @ mean
+    covariance = to_names @ vehicle.covariance @ to_names.T + design @ covariance @ design.T
     return _wald(difference, covariance, min(vehicle.dof, simulator.dof))
 
 
@@ -195,14 +195,20 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
 
 
 def trace_of(selection: EffectSelection, fit: Fit, effect: Effect) -> Array:
-    """Return (M, A) m/s that an effect adds, without the part absorbed by misalignment, scale and other effects."""
+    """Return the residual (M, A) m/s that an effect adds, without the part that other parameters can absorb.
+
+    M: bins of time. A: compared axes.
+    """
     others = [other for other in fit.effects if other is not effect]
     without = selection.fitter.fit(fit.hypothesis.with_effects(others, fit.n_recordings, {}), fit.noise, 4)
     return without.residual - fit.residual
 
 
 def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
-    """Return axis, regime and band with most of a trace (M, A); the regime by energy per time."""
+    """Return the axis, regime of motion and frequency band with most energy of a trace (M, A) m/s.
+
+    A regime is named by its energy per time, compared with the whole run.
+    """
     problem = selection.fitter.problem
     energy = trace**2
     total = max(float(energy.sum()), 1e-300)
@@ -217,14 +223,11 @@ def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
     nyquist = 0.5 / problem.interval
     power = (np.abs(np.fft.rfft(trace, axis=0)) ** 2).sum(axis=1)
     frequency = np.linspace(0.0, nyquist, len(power))
-    bands = [
-        (
-            low,
-            min(high, nyquist),
-            float(power[(frequency >= low) & (frequency < high)].sum() / max(power.sum(), 1e-300)),
-        )
-        for low, high in itertools.pairwise(BANDS_HZ)
-        if low < nyquist
-    ]
-    low, high, band_share = max(bands, key=lambda band: band[2])
-    return Lies(names[axis], float(energy[:, axis].sum()) / total, regime, share, (float(low), float(high)), band_share)
+    bands = [(low, high) for low, high in itertools.pairwise(BANDS_HZ) if low < nyquist]
+    powers = [power[(frequency >= low) & (frequency < high)].sum() for low, high in bands]
+    strongest = int(np.argmax(powers))
+    low, high = bands[strongest]
+    return Lies(
+        names[axis], float(energy[:, axis].sum()) / total, regime, share, (float(low), float(min(high, nyquist))),
+        float(powers[strongest] / max(power.sum(), 1e-300)),
+    )  # fmt: skip

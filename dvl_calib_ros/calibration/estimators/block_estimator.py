@@ -152,7 +152,9 @@ class FullEstimator(Estimator):
         covariance: Array = np.zeros((N_STATE, N_STATE))
         if not self.claims:
             return covariance
-        registration = self._solver.registration() if self._is_settled else self._result_in_effect.looked.registration
+        registration = (
+            self._solver.registration() if self._is_settled else self._result_in_effect.registered.registration
+        )
         if registration is not None:
             states_from_open = np.eye(len(_OPEN))
             # rotation and misalignment have opposite signs
@@ -209,12 +211,12 @@ class FullEstimator(Estimator):
 
     def residuals(self, *, fresh: bool) -> Residuals | None:
         """See `Estimator`."""
-        return self._idle_solver().residuals() if fresh else self._result_in_effect.looked.residuals
+        return self._idle_solver().residuals() if fresh else self._result_in_effect.registered.residuals
 
     @property
     def registration_so_far(self) -> Registration | None:
         """Registration by the newest result in effect."""
-        return self._result_in_effect.looked.registration
+        return self._result_in_effect.registered.registration
 
     @property
     def suggestion_so_far(self) -> Reason | None:

@@ -184,7 +184,7 @@ def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
     weight, level = np.ones((len(rows), 2)), 1.0
     theta = np.zeros(N_THETA)
     for _ in range(12):
-        centred = rows - _of_stretches(rows, weight, stretch)[stretch]
+        centred = rows - _stretch_means(rows, weight, stretch)[stretch]
         flat = centred.reshape(-1, N_THETA + 1)
         products = (flat * weight.reshape(-1, 1)).T @ flat  # of y and the columns
         theta = np.linalg.solve(products[1:, 1:] + np.diag((level / std) ** 2), products[1:, 0])
@@ -194,7 +194,7 @@ def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
     return theta
 
 
-def _of_stretches(rows: Array, weight: Array, stretch: Index) -> Array:
+def _stretch_means(rows: Array, weight: Array, stretch: Index) -> Array:
     """Return weighted means (S, 2, 14) of rows (N, 2, 14) per stretch. weight: (N, 2). stretch: (N,)."""
     sums, total = np.zeros((int(stretch[-1]) + 1, *rows.shape[1:])), np.zeros((int(stretch[-1]) + 1, 2))
     np.add.at(sums, stretch, rows * weight[..., None])
@@ -211,8 +211,8 @@ def _no_outliers(residual: Array, stretch: Index) -> Mask:
     is_near = np.abs(from_neighbours) < OUTLIER_Z * np.maximum(robust_std(from_neighbours), 1e-6)
     from_stretch = residual.copy()
     for number in np.unique(stretch):
-        own = stretch == number
-        from_stretch[own] -= median(residual[own])
+        in_stretch = stretch == number
+        from_stretch[in_stretch] -= median(residual[in_stretch])
     in_reach = np.abs(from_stretch) < LASTING_OUTLIER_Z * np.maximum(robust_std(from_stretch), MIN_NOISE_M)
     return np.asarray((is_near & in_reach).all(axis=1))
 
@@ -245,13 +245,13 @@ def _hypotheses(blocks: _Blocks) -> Array:
     seconds, white = blocks.seconds, 1.0 / blocks.weight
     usual = float(median(white))
     is_same_stretch = blocks.stretch[:, None] == blocks.stretch
-    starts = np.array([seconds[blocks.stretch == each][0] for each in blocks.stretch])
+    starts = np.array([seconds[blocks.stretch == number][0] for number in blocks.stretch])
     walk = np.where(is_same_stretch, np.minimum(seconds[:, None], seconds) - starts[:, None], 0.0) / WALK_S
     apart = np.abs(seconds[:, None] - seconds)
     lasting = [np.zeros_like(apart)] + [size * np.exp(-apart / tau) for size in LASTING for tau in LASTING_S]
-    each = np.array([process + size * walk for process in lasting for size in WALKED]) * usual + np.diag(white)
-    largest = np.diagonal(each, axis1=1, axis2=2).max(axis=1)
-    return np.asarray(each + FREE_VARIANCE * largest[:, None, None] * is_same_stretch)
+    covariance = np.array([process + size * walk for process in lasting for size in WALKED]) * usual + np.diag(white)
+    largest = np.diagonal(covariance, axis1=1, axis2=2).max(axis=1)
+    return np.asarray(covariance + FREE_VARIANCE * largest[:, None, None] * is_same_stretch)
 
 
 class _NormalEquations(NamedTuple):
@@ -331,14 +331,14 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> GaussianState:
     """Return the posterior from the mixture of all hypotheses."""
     if not len(blocks.seconds):
         return prior
-    each = _posteriors(_normal_equations(blocks), prior)
-    weight = np.exp(each.log_evidence - each.log_evidence.max())
+    posteriors = _posteriors(_normal_equations(blocks), prior)
+    weight = np.exp(posteriors.log_evidence - posteriors.log_evidence.max())
     weight /= weight.sum()
-    mean = np.einsum("gf,gfi->i", weight, each.x)
-    apart = each.x - mean
+    mean = np.einsum("gf,gfi->i", weight, posteriors.x)
+    spread = posteriors.x - mean
     # variance of Student's t, as few degrees of freedom determine the white variance
-    p = each.p * (each.freedom / (each.freedom - 2.0))[..., None, None]
-    total = np.einsum("gf,gfij->ij", weight, p) + np.einsum("gf,gfi,gfj->ij", weight, apart, apart)
+    p = posteriors.p * (posteriors.freedom / (posteriors.freedom - 2.0))[..., None, None]
+    total = np.einsum("gf,gfij->ij", weight, p) + np.einsum("gf,gfi,gfj->ij", weight, spread, spread)
     return GaussianState(mean, 0.5 * (total + total.T))
 
 
@@ -527,12 +527,12 @@ class DeadReckoning:
         known = (at_s >= seconds[0]) & (stretch[after] == stretch[after - 1])
         fixes, at_s, after = fixes.part(np.flatnonzero(known)), at_s[known], after[known]
         share = ((at_s - seconds[after - 1]) / (seconds[after] - seconds[after - 1]))[:, None]
-        found = sums[after - 1] + share * (sums[after] - sums[after - 1])
+        integrals = sums[after - 1] + share * (sums[after] - sums[after - 1])
         n, nearest = len(at_s), after - (share[:, 0] < 0.5)
         rotation = rotation_from_quaternion(quaternion[nearest])
         rate = (rates[after - 1] + share * (rates[after] - rates[after - 1]))[:, _WAY].reshape(n, 3, 3, 3)
         velocity = np.einsum("nabc,bc->na", rate, self._body_from_dvl)
-        way, drifted = found[:, _WAY].reshape(n, 3, 3, 3), found[:, _DRIFTED].reshape(n, 3, N_HEADING)
+        way, drifted = integrals[:, _WAY].reshape(n, 3, 3, 3), integrals[:, _DRIFTED].reshape(n, 3, N_HEADING)
         self._done.append(Legs(at_s, stretch[after], way, drifted, rotation, velocity, fixes.position, fixes.variance))
 
 
