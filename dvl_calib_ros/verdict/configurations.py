@@ -31,7 +31,7 @@ CONFIGURATIONS = on_page(
     reject(
         "DVL_AXES_TURNED",
         "the DVL's axes look turned over: y and z point the other way",
-        means="Forward-right-down for forward-left-up, or the reverse.",
+        means="The driver sends forward-right-down for forward-left-up, or the reverse.",
         remedy="set {parameter} to {value}",
     ),
     reject(
@@ -123,7 +123,7 @@ CONFIGURATIONS = on_page(
     reject(
         "RATES_SCALED",
         "an angular velocity that is {times:.2g} times as large",
-        means="Not in rad/s, or of a wrong scale.",
+        means="The driver does not send rad/s, or its scale is wrong.",
     ),
     reject("RATES_IN_EARTH", "an angular velocity about the axes of the earth ({frame}), not of the body"),
     reject(
@@ -175,7 +175,7 @@ CONFIGURATIONS = on_page(
     reject(
         "CLOCK_OFF",
         "{whose} stamps are {seconds:.3f} ± {std:.3f} s {way} against {against}",
-        means="Estimated from velocities and turns.",
+        means="The offset is estimated from velocities and turns.",
     ),
     reject(
         "CLOCK_LATE",
@@ -248,7 +248,7 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_ASTERN",
         "with the mounting {given} the vehicle travels astern; it goes ahead with {found}",
-        means="A vehicle that drives astern looks the same; a mounting configured with -p is used without a check.",
+        means="A vehicle that was driven astern gives the same data. A mounting set with -p is used without a check.",
         remedy="try -p mounting_rpy:={option}{also}; if the vehicle did drive astern, record it driving ahead",
     ),
     marginal(
@@ -282,14 +282,14 @@ DISCOVERIES = on_page(
     accept(
         "SEVERAL_REFERENCES",
         "{topic} is taken as the reference, not {others}; --gnss-topic names another",
-        means="Satellites go first, then a simulator's truth, then an INS.",
+        means="Satellite navigation is preferred, then a simulator's truth, then an INS.",
     ),
     accept("FRAME_NOT_IN_TREE", "no transform for the DVL's frame {frame!r}; using frame {other!r} instead"),
     accept("REFERENCE_FRAME_NOT_TOLD", "{topic}: its frame is unknown, and not observable without an IMU"),
     accept(
         "MOUNTING_GUESSED",
         "mounting {mounting}, {why}: nothing in the bag says how the DVL is mounted (-p mounting_rpy:={option}){also}",
-        means="Estimated from the data, rounded to a quarter turn where that fits.",
+        means="The mounting is estimated from the data, and rounded to a quarter turn where that fits.",
     ),
     accept(
         "TRANSFORM_NOT_ROTATION",

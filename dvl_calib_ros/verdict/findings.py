@@ -25,7 +25,7 @@ FINDINGS = (
     error(
         "DVL_SILENT",
         "no usable DVL message for {seconds:.0f} s",
-        means="Other findings can say why.",
+        means="Another finding may name the cause.",
         remedy="check the sensor, its driver and the topic {topic}",
     ),
     warning(
@@ -65,7 +65,7 @@ FINDINGS = (
     warning(
         "STAMP_MISSING",
         "{stream}: messages without a header stamp, the time of reception is used",
-        means="`header.stamp` is zero; the time of reception is late.",
+        means="`header.stamp` is zero, and a message is received later than it was measured.",
         remedy="let the driver fill header.stamp",
     ),
     warning(
@@ -76,7 +76,7 @@ FINDINGS = (
     warning(
         "STAMPS_FAR",
         "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, too far from the others",
-        means="A computer without a clock battery.",
+        means="The clock of a computer was not set, for instance without a clock battery.",
         remedy=(
             "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording"
         ),
@@ -95,7 +95,7 @@ FINDINGS = (
     warning(
         "SAMPLES_LATE",
         "{count} {stream} samples arrived too late for their DVL samples and are not used",
-        remedy="raise max_latency; for a bag that is played at ten times its speed, ten times as high",
+        remedy="raise max_latency; if a bag is played at ten times its speed, to ten times the value",
     ),
     warning(
         "MODEL_RESTARTED",
@@ -125,14 +125,14 @@ FINDINGS = (
     warning(
         "TOPIC_OTHER_TYPE",
         "{topic}: {name} publishes {type} instead of {expected}; its messages are not received",
-        means="The warning names the parameter.",
+        means="The remedy in the warning names the parameter to set.",
         remedy="{remedy}",
     ),
     warning(
         "TOPIC_QOS",
         "{topic}: the QoS of {name} is incompatible; its messages are not received ({reason})",
-        means="The publisher offers less than the node asks for.",
-        remedy="set the publisher's durability to volatile, its reliability to either",
+        means="The publisher offers less reliability or durability than the node requests.",
+        remedy="set the publisher's durability to volatile; either reliability works",
     ),
     warning(
         "OUTPUT_QOS",
@@ -169,7 +169,7 @@ FINDINGS = (
     warning(
         "DVL_FRAME",
         "dvl: a message has frame_id {frame_id!r} where {expected!r} is expected; it is not used",
-        means="Another frame than configured, or the body's.",
+        means="The message's frame is not the configured one, or it is the body's.",
         remedy=(
             "let the driver publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is "
             "its name"
@@ -179,13 +179,13 @@ FINDINGS = (
         "DVL_TURNED_TWICE",
         "dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and mounting_rpy "
         "turns the DVL upside down as well",
-        means="Right only for a DVL that looks up.",
+        means="Both together are right only for a DVL that looks up.",
         remedy="if mounting_rpy describes a frame whose z points down, set dvl_axes to flu",
     ),
     warning(
         "REFERENCE_FRAME",
         "reference not used: its frame_id {frame_id!r} is neither {base} nor an earth frame",
-        means="Earth frames are enu, map, odom, world and ned. After a turn the node chooses by the data (`discover`).",
+        means="Earth frames are enu, map, odom, world and ned. `discover` chooses by the data after a turn.",
         remedy="set gnss_frame to body, enu or ned",
     ),
     warning(
@@ -202,7 +202,7 @@ FINDINGS = (
     warning(
         "MESSAGE_UNDECODABLE",
         "{stream}: a message could not be decoded ({reason}); it is skipped",
-        means="Truncated, or of another version of its package.",
+        means="The message is truncated, or of another version of its package.",
         remedy="rebuild the driver's messages; ros2 bag convert where the package is installed",
     ),
     warning(
@@ -235,9 +235,9 @@ FINDINGS = (
     ),
     warning(
         "DVL_REPEATS",
-        "{count} DVL samples repeat the velocity before exactly and are used",
+        "{count} DVL samples repeat the previous velocity exactly; they are used",
         means="Only a simulated velocity without noise repeats exactly.",
-        remedy="if its driver hangs, set max_repeats",
+        remedy="if the driver repeats its last velocity without a new measurement, set max_repeats",
     ),
     # GNSS
     warning(
@@ -329,9 +329,9 @@ FINDINGS = (
     ),
     warning(
         "ONE_SPEED",
-        "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
+        "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s like "
         "{degrees:.1f}° or {percent:.1f} %; σ includes an error of dvl_bias_std",
-        remedy="drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
+        remedy="drive at two speeds, one twice the other; set dvl_bias_std to the DVL's accuracy, if you know it",
     ),
     warning(
         "DVL_BIAS",
@@ -352,7 +352,7 @@ FINDINGS = (
         "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
         "on every heading",
         means="The DVL tracks moving sediment or a layer of water.",
-        remedy="calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
+        remedy="calibrate where the bed is still; to estimate the bed's velocity: -p reference_offset_std:={std:g}",
     ),
     warning(
         "VELOCITY_SMOOTHED",
@@ -388,7 +388,7 @@ FINDINGS = (
     ),
     warning(
         "ONE_HEADING",
-        "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
+        "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s like "
         "{degrees:.1f}° or {percent:.1f} %; σ includes the reference's constant error",
         remedy=(
             "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's "
@@ -408,13 +408,14 @@ FINDINGS = (
     ),
     warning(
         "INITIAL_CONTRADICTED",
-        "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so it is left out",
+        "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so the file is "
+        "not used",
         remedy="inspect the mounting; if it is right, save this result and start from that",
     ),
     warning(
         "RESULT_WORSE",
         "{path} is kept, because it is better ({before}); the newer result ({now}) is {beside}",
-        remedy="to use the newer result anyway, rename its file, or call ~/save_anyway",
+        remedy="to use the newer result anyway, rename the kept file, or call ~/save_anyway",
     ),
     warning(
         "RESULT_NOT_SAVED",
@@ -453,7 +454,10 @@ DOCTOR = on_page(
     error(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
-        remedy="record both together; if they were, check the clocks, and for import the times of both files",
+        remedy=(
+            "record both together; if they were recorded so, check the clocks, and after an import the times of both "
+            "files"
+        ),
     ),
     warning(
         "DOCTOR_REPEATED_STAMP",
@@ -480,7 +484,7 @@ DOCTOR = on_page(
     warning(
         "DOCTOR_ZEROS",
         "{topic}: {share:.0%} of the velocities are exactly zero",
-        remedy="let the driver send nothing, or mark it invalid; these are not used",
+        remedy="let the driver send nothing without a measurement, or mark the velocity invalid; zeros are not used",
     ),
     warning(
         "DOCTOR_REFUSED",
@@ -508,7 +512,7 @@ DOCTOR = on_page(
     warning(
         "DOCTOR_NOT_FINITE",
         "{topic}: {share:.0%} of the velocities are not finite",
-        remedy="check lock or fix at that time; these are not used",
+        remedy="check bottom lock or fix at that time; such velocities are not used",
     ),
     error(
         "DOCTOR_NO_ORIENTATION",
@@ -528,7 +532,7 @@ DOCTOR = on_page(
     error(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
-        remedy="let its driver convert to m/s; check the beam angle and the beam order of the DVL as well",
+        remedy="let the driver convert to m/s; check the beam angle and the beam order of the DVL as well",
     ),
     error(
         "DOCTOR_DISAGREE",
