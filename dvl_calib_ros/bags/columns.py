@@ -267,7 +267,7 @@ def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
     walk = _LayoutWalk(store, data)
     walk.message("", msgtype)
     if not walk.at <= len(data) <= walk.at + _PADDING:
-        raise NoLayoutError("of another length than it says")
+        raise NoLayoutError("its length differs from the announced one")
     fields = walk.fields
     dtype = np.dtype(
         {
@@ -356,7 +356,7 @@ class _LayoutWalk:
     def _add(self, path: str, format_: Any, size: int) -> None:
         """Add a column of this NumPy format and number of bytes."""
         if len(self.fields) > _MOST_FIELDS:
-            raise NoLayoutError("more fields than are worth it")
+            raise NoLayoutError("more fields than can be read as columns")
         self.fields[path] = format_, self.at
         self.at += size
 

@@ -427,7 +427,7 @@ class Database:
                 if sound:
                     yield self._batch(log_ns[:sound], number[:sound], data[:sound])
                 if sound < len(rows):
-                    raise DamagedError("a message is none")
+                    raise DamagedError("a message is missing or damaged")
             if error is not None:
                 raise error
 
@@ -480,5 +480,5 @@ def _rows(connection: sqlite3.Connection, query: str, types: tuple[type, ...]) -
     except UnicodeDecodeError as error:  # SQLite's message would contain the damaged names
         raise DamagedError("its tables are damaged") from error
     if any(type(value) is not expected for row in rows for value, expected in zip(row, types, strict=True)):
-        raise DamagedError("a table holds what recordings do not")
+        raise DamagedError("a table holds values that no recording has")
     return rows

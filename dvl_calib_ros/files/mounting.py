@@ -240,8 +240,8 @@ def calibrated_urdf(
         raise InputError(
             f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(current))} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
-            f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
-            "or write the calibrated one anyway with --force"
+            f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's mounting (dvl-calib parameters "
+            "--urdf), or write the calibrated mounting anyway with --force"
         )
     began_at = np.array(calibrated.parameters.lever_arm) + calibrated.parameters.reference_position
     if not is_placed and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
@@ -276,8 +276,8 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
         if not any(np.allclose(now, each, rtol=0.0, atol=within) for each in known) and not force:
             raise InputError(
                 f"{path}: sets {name} to {as_yaml(in_file.as_dict()[name])}, but {calibrated.path} began with "
-                f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's, or write the calibrated "
-                "one anyway with --force"
+                f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's value, or write "
+                "the calibrated value anyway with --force"
             )
     return with_parameters(path, values)
 

@@ -39,7 +39,7 @@ def check_outputs(files: Mapping[str, Path], inputs: Iterable[Path], folders: Ma
                 raise InputError(f"{option} {output.path}: would write over the input {path}, or into it; name another")
     for (one, a), (other, b) in combinations(written.items(), 2):
         if a.meets(b):
-            raise InputError(f"{one} and {other}: both name {b.path}, or its backup; give them names of their own")
+            raise InputError(f"{one} and {other}: both write {b.path} or its backup; give each a name of its own")
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ def _recorded_sound(
     if abs(now.get(SPEED_OF_SOUND, used) - used) > SAME_SPEED:
         raise InputError(
             f"{SPEED_OF_SOUND}={now[SPEED_OF_SOUND]:g}: the recording says that the DVL used {used:.1f} m/s; leave "
-            "this setting out, or calibrate with a recording of it"
+            "this setting out, or calibrate with a recording that used it"
         )
     return {SPEED_OF_SOUND: round(used, 2)}
 

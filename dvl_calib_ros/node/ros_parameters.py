@@ -56,7 +56,7 @@ def declare_parameters(node: AnsweringNode, files: Sequence[Path] = ()) -> Param
         node.undeclare_parameter(name)
     ignored = sorted(names_elsewhere & given.keys())
     if ignored:
-        node.info(f"not ours, though set for all nodes: {', '.join(ignored)}")
+        node.info(f"set for all nodes, but no parameters of this node: {', '.join(ignored)}")
     parameters = Parameters.from_mapping({name: value for name, value in given.items() if name not in names_elsewhere})
     for name, spec in SCHEMA.items():
         node.declare_parameter(name, parameters.as_dict()[name], descriptor(spec), ignore_override=True)

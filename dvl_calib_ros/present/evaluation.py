@@ -113,7 +113,7 @@ def evaluation(e: Evaluation) -> Document:
             section("Velocity error after calibration", *_scores(e)),
             _error_by_time(e),
             *([_convergence(e)] if e.convergence else []),
-            section("What was done before", baselines),
+            section("Earlier methods", baselines),
             *(
                 section(f"Can the uncertainty be trusted? {title}", *_coverage(found))
                 for title, found in coverages
@@ -238,7 +238,7 @@ def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
         rows.append((coverage.model, *pooled, *(shares.get(name, "–") for name in states), str(coverage.n_errors)))
     named = [re.sub("^(phi_|delta_k_?)", lambda found: SYMBOLS[found[0]], name) for name in states]
     yield Table(
-        ("model", "68 % interval", "95 % interval", *named, "errors each"),
+        ("model", "68 % interval", "95 % interval", *named, "number of errors per state"),
         rows,
         notes=(
             "Per cent of the errors (estimate minus truth) inside the interval that σ claims, over all states and for "
@@ -370,7 +370,9 @@ def cross_check(check: CrossCheck) -> Document:
         sections=[
             section(
                 "",
-                Sentence("Each bag calibrates, and every other one that has a reference is corrected with that."),
+                Sentence(
+                    "Each bag calibrates once; every other bag that has a reference is corrected with the result."
+                ),
                 where=Where.PAGE,
             ),
             section(

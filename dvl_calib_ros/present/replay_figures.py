@@ -515,7 +515,7 @@ def data_pictures(result: Result, history: RunHistory, models: Sequence[str]) ->
         picture(
             "Samples by model", "How many DVL samples each model used, gated or was not given",
             samples_by_fate, list(models), fates,
-            caption="Not given: without the GNSS velocity or attitude it needs, or in the window of its prior.",
+            caption="Not given: samples without a GNSS velocity or attitude, or in the window of the prior.",
         ),
         picture(
             "Selected model and GNSS", f"Which model was selected over time: {switches}; and when GNSS was there",

@@ -216,5 +216,5 @@ def _columns(payload: bytes) -> list[Any]:
         offset += size
         values.append(value)
     if offset != len(payload):
-        raise ValueError("not as long as it says")
+        raise ValueError("its length differs from the announced one")
     return values

@@ -181,7 +181,7 @@ def _recursion_of_one(
         innovation = z[i] - h @ x
         nis_i = float(innovation @ _solve_definite(hpht + r_i, innovation))
         if not math.isfinite(nis_i):
-            raise np.linalg.LinAlgError("the numbers have run away")
+            raise np.linalg.LinAlgError("the filter diverged")
         is_used = usable[i] and nis_i <= gate[i]
         if is_used:
             if weight[i] != 1.0:  # the gate tests the sample at full weight; only the update uses the reduced one
