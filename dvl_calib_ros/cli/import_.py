@@ -38,9 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write (for a folder: folder of bags)")
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="reference velocities, or a receiver's NMEA (RMC)")
     parser.add_argument("--attitude", type=Path, metavar="FILE", help="roll, pitch, yaw in north-east-down")
-    parser.add_argument(
-        "--frame", choices=("frd", "flu"), default="frd", help="axes of the DVL's data; default: %(default)s"
-    )
+    parser.add_argument("--frame", choices=("frd", "flu"), default="frd", help="axes of the DVL; default: %(default)s")
     frames = ("frd", "flu", "enu", "ned")
     parser.add_argument("--gnss-frame", choices=frames, default="frd", help="default: %(default)s")
     parser.add_argument(

@@ -32,9 +32,7 @@ CLOCKS_HZ = (0.1, 1000.0)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag file")
-    parser.add_argument(
-        "-r", "--rate", type=float, default=1.0, help="speed as a multiple of real time; default: %(default)g"
-    )
+    parser.add_argument("-r", "--rate", type=float, default=1.0, help="multiple of real time; default: %(default)g")
     parser.add_argument("-l", "--loop", action="store_true", help="repeat until Ctrl-C")
     parser.add_argument(
         "-d", "--delay", type=float, default=0.0, metavar="S", help="wait S seconds before the first message"

@@ -66,14 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--misalignment", nargs=3, type=float, default=none, metavar=angles,
         help="rotation of the DVL from its nominal mounting, degrees",
     )  # fmt: skip
-    parser.add_argument(
-        "--scale",
-        nargs="+",
-        type=float,
-        default=[0.0],
-        metavar="PERCENT",
-        help="scale error: one number, or one per axis",
-    )
+    scale_help = "scale error: one number, or one per axis"
+    parser.add_argument("--scale", nargs="+", type=float, default=[0.0], metavar="PERCENT", help=scale_help)
     parser.add_argument(
         "--mounting-rpy", nargs=3, type=float, default=none, metavar=angles,
         help="nominal mounting, rad, as parameter mounting_rpy",
@@ -236,10 +230,7 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
         help="nav_msgs/Odometry of a vehicle driven elsewhere, such as in another simulator; until Ctrl-C",
     )  # fmt: skip
     live.add_argument(
-        "--speed",
-        type=float,
-        default=1.0,
-        help="speed as a multiple of real time, without --follow; default: %(default)g",
+        "--speed", type=float, default=1.0, help="multiple of real time, without --follow; default: %(default)g"
     )
     live.add_argument("--wait", action="store_true", help="begin when DVL, GNSS and IMU have a subscriber each")
     live.add_argument(

@@ -100,23 +100,25 @@ class FrameTree:
         known = {*self._parents, *(parent for parent, *_ in self._parents.values())}
         if name in known:
             return name
-        last = name.rsplit("/", 1)[-1]
-        same = [each for each in known if last and each.rsplit("/", 1)[-1] == last]
+        last = _last_part(name)
+        same = [other for other in known if last and _last_part(other) == last]
         return same[0] if len(same) == 1 else None
 
     def base(self, frame: str, wanted: str) -> str | None:
-        """Return the body above a frame: `wanted`, with any namespace; else the highest that is no earth frame."""
+        """Return the body frame above a frame; None if there is none.
+
+        This is the frame named `wanted`, in any namespace, else the highest one that is no earth frame.
+        """
         name = frame
         above: list[str] = []
         while name in self._parents and len(above) < LONGEST_CHAIN:
             name = self._parents[name][0]
             above.append(name)
-        last = _plain(wanted).rsplit("/", 1)[-1]
         for link in above:
-            if link.rsplit("/", 1)[-1] == last:
+            if _same(link, wanted):
                 return link
-        vehicle = [link for link in above if link.rsplit("/", 1)[-1].lower() not in EARTH_NAMES]
-        return vehicle[-1] if vehicle else None
+        of_vehicle = [link for link in above if _last_part(link).lower() not in EARTH_NAMES]
+        return of_vehicle[-1] if of_vehicle else None
 
     def placed(self, frame_id: str, base_frame: str) -> Placed | None:
         """Return the pose of a frame in the body; None if the transforms do not connect them."""
@@ -150,8 +152,14 @@ def _plain(frame_id: str) -> str:
     return frame_id.strip("/")
 
 
+def _last_part(frame: str) -> str:
+    """Return the name of a frame without its namespace."""
+    return frame.rsplit("/", 1)[-1]
+
+
 def _same(frame: str, base: str) -> bool:
-    return frame.rsplit("/", 1)[-1] == _plain(base).rsplit("/", 1)[-1]
+    """Return whether two names are one frame, but for namespaces."""
+    return _last_part(frame) == _last_part(_plain(base))
 
 
 # range of parameter lever_arm, m; a larger value is a transform in another unit

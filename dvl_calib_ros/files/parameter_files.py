@@ -28,10 +28,7 @@ MISSPELT = 0.8
 
 
 def load_parameters(
-    path: Path | None,
-    overrides: Sequence[str] = (),
-    defaults: Mapping[str, Any] | None = None,
-    text: str | None = None,
+    path: Path | None, overrides: Sequence[str] = (), defaults: Mapping[str, Any] | None = None, text: str | None = None
 ) -> Parameters:
     """Load parameters from a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
 

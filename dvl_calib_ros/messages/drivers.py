@@ -174,10 +174,7 @@ def _has_no_range(message: Any) -> Any:
 
 # without bottom lock the sensor sends altitude -1; 0 means that the driver does not fill it
 _NO_BOTTOM = Rule(
-    "no_bottom",
-    "`altitude` is negative or not finite",
-    lambda message, _: _has_no_altitude(message),
-    CHECK_LOCK,
+    "no_bottom", "`altitude` is negative or not finite", lambda message, _: _has_no_altitude(message), CHECK_LOCK
 )
 _NO_BOTTOM_NOR_RANGES = Rule(
     "no_bottom",

@@ -11,13 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.assessment.manoeuvre_planner import (
-    Outlook,
-    RecentMotion,
-    is_good_enough,
-    noise_of_a_second,
-    outlook,
-)
+from ..calibration.assessment.manoeuvre_planner import Outlook, RecentMotion, is_good_enough, noise_of_a_second, outlook
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.observability import KM, PredictedDrift, predicted_drift
 from ..calibration.models import MODELS

@@ -233,13 +233,7 @@ def _main_numbers(d: Diagnosis) -> list[Number]:
         note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=note))
     reported = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    found.append(
-        Number(
-            "noise",
-            f"{mm(gap.noise_floor)} mm/s",
-            note=f"white and slow noise together, fitted by likelihood{reported}",
-        )
-    )
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white plus slow, by likelihood{reported}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="beyond the noise")]
 
 

@@ -370,9 +370,7 @@ def cross_check(check: CrossCheck) -> Document:
         sections=[
             section(
                 "",
-                Sentence(
-                    "Each bag calibrates once; every other bag that has a reference is corrected with the result."
-                ),
+                Sentence("Each bag calibrates; all other bags with a reference are corrected with the result."),
                 where=Where.PAGE,
             ),
             section(

@@ -112,7 +112,5 @@ def directions(angle: float) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 SIMULATOR = Simulator(
-    TITLE,
-    write,
-    "use it as the node's parameter file; its odometry must be of the reference point, forward-left-up",
+    TITLE, write, "use it as the node's parameter file; its odometry must be of the reference point, forward-left-up"
 )

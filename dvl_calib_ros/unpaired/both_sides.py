@@ -143,9 +143,7 @@ class Log:
 
 
 def read_log(
-    source: RecordedSide,
-    on_progress: Callable[[float], None] = lambda _: None,
-    with_series: bool = False,
+    source: RecordedSide, on_progress: Callable[[float], None] = lambda _: None, with_series: bool = False
 ) -> Log:
     """Read and diagnose one side. Raises InputError if it cannot be compared."""
     loaded = load_recordings(source.opened, source.parameters, source.topics)

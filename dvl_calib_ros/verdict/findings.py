@@ -408,8 +408,7 @@ FINDINGS = (
     ),
     warning(
         "INITIAL_CONTRADICTED",
-        "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so the file is "
-        "not used",
+        "the data contradict initial_calibration {file}: the mounting has moved {difference} since; it is not used",
         remedy="inspect the mounting; if it is right, save this result and start from that",
     ),
     warning(
@@ -454,10 +453,7 @@ DOCTOR = on_page(
     error(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
-        remedy=(
-            "record both together; if they were recorded so, check the clocks, and after an import the times of both "
-            "files"
-        ),
+        remedy="record both together; if they were, check the clocks, or the times of both imported files",
     ),
     warning(
         "DOCTOR_REPEATED_STAMP",

@@ -152,9 +152,7 @@ class FullEstimator(Estimator):
         covariance: Array = np.zeros((N_STATE, N_STATE))
         if not self.claims:
             return covariance
-        registration = (
-            self._solver.registration() if self._is_settled else self._result_in_effect.registered.registration
-        )
+        registration = self._solver.registration() if self._is_settled else self._result_in_effect.clocks.registration
         if registration is not None:
             states_from_open = np.eye(len(_OPEN))
             # rotation and misalignment have opposite signs
@@ -211,12 +209,12 @@ class FullEstimator(Estimator):
 
     def residuals(self, *, fresh: bool) -> Residuals | None:
         """See `Estimator`."""
-        return self._idle_solver().residuals() if fresh else self._result_in_effect.registered.residuals
+        return self._idle_solver().residuals() if fresh else self._result_in_effect.clocks.residuals
 
     @property
     def registration_so_far(self) -> Registration | None:
         """Registration by the newest result in effect."""
-        return self._result_in_effect.registered.registration
+        return self._result_in_effect.clocks.registration
 
     @property
     def suggestion_so_far(self) -> Reason | None:

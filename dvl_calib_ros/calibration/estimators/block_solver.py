@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
     counts: samples used, outliers (spikes and rejected residuals), and mean squared residual.
     claims: references with their own noise, minus those without.
     has_rows: whether any reference has been used.
-    registered: latest registration.
+    clocks: latest registration.
     suggestion: live, the configuration that fits by it.
     """
 
@@ -59,7 +59,7 @@ class Outcome(NamedTuple):
     counts: ModelCounts
     claims: int
     has_rows: bool
-    registered: RegistrationResult = RegistrationResult()
+    clocks: RegistrationResult = RegistrationResult()
     suggestion: Reason | None = None
 
 
@@ -145,7 +145,7 @@ class BlockSolver:
             return_memory()
         registered = self._clocks.latest(fresh=False)
         suggestion = self.suggestion(fresh=False) if self._is_live else None
-        return [outcome._replace(registered=registered, suggestion=suggestion) for outcome in outcomes]
+        return [outcome._replace(clocks=registered, suggestion=suggestion) for outcome in outcomes]
 
     def _solve(self, block: Block) -> Outcome:
         """Check a block's samples and add them to the fit."""

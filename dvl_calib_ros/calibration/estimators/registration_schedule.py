@@ -177,9 +177,8 @@ class RegistrationSchedule:
 
     def register_again(self, fit_so_far: FitSoFar | None) -> None:
         """Repeat the registration if there is enough new data. fit_so_far: the fit so far; None without data."""
-        if self._contradicted is None and self._blocks >= max(
-            REPEATED_AT_GROWTH * self._latest.blocks, FIRST_LIVE_BLOCKS
-        ):
+        enough = max(REPEATED_AT_GROWTH * self._latest.blocks, FIRST_LIVE_BLOCKS)
+        if self._contradicted is None and self._blocks >= enough:
             self._latest = self._register(fit_so_far)
 
     def latest(self, fit_so_far: FitSoFar | None = None, *, fresh: bool = True) -> RegistrationResult:
