@@ -141,10 +141,10 @@ def _find_in_recording(
     return FoundClocks(registration, offsets, hypothesis)
 
 
-def _residual_without_noise(found: Registration, motion: MotionStreams) -> float:
+def _residual_without_noise(registration: Registration, motion: MotionStreams) -> float:
     """Return the residual of a registration without the reference's noise, as a share of the speed."""
-    noise = 3.0 * white_noise(motion.reference) / max(found.speed, 1e-9) ** 2
-    return math.sqrt(max(found.residual**2 - noise, 0.0))
+    noise = 3.0 * white_noise(motion.reference) / max(registration.speed, 1e-9) ** 2
+    return math.sqrt(max(registration.residual**2 - noise, 0.0))
 
 
 def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Parameters]:
@@ -177,12 +177,12 @@ def _one_per_interval(block: SampleBlock) -> SampleBlock:
     return block.part(np.flatnonzero(np.diff(bins, prepend=-1)))
 
 
-def on_imu_clock(recording: Recording, topics: Topics, found: Registration) -> Survey:
+def on_imu_clock(recording: Recording, topics: Topics, registration: Registration) -> Survey:
     """Return the previewed streams with their stamps corrected to the IMU's clock by a registration."""
     survey = recording.whole(topics)
-    delays_s = {topics.dvl: found.dvl.delay_s, topics.gnss: found.reference.delay_s}
-    if not found.is_turned:  # without turns only the delay between DVL and reference is observable
-        delays_s = {topics.dvl: found.apart.delay_s}
+    delays_s = {topics.dvl: registration.dvl.delay_s, topics.gnss: registration.reference.delay_s}
+    if not registration.is_turned:  # without turns only the delay between DVL and reference is observable
+        delays_s = {topics.dvl: registration.apart.delay_s}
     previews = {
         name: replace(preview, stamps_s=preview.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
         for name, preview in survey.previews.items()

@@ -336,8 +336,8 @@ def _is_compared_over_legs(reference: Recorded) -> bool:
     return is_position and (is_noisy or topic_checks.interval_s(reference) > SELDOM_S)
 
 
-def _has_error(found: Sequence[Reason]) -> bool:
-    return any(reason.severity is Severity.ERROR for reason in found)
+def _has_error(reasons: Sequence[Reason]) -> bool:
+    return any(reason.severity is Severity.ERROR for reason in reasons)
 
 
 def _units(dvl: Recorded, reference: Recorded) -> list[Reason]:
@@ -399,14 +399,14 @@ def _observability(replayed: Replayed) -> tuple[Shown, ...]:
     return tuple(_one_shown(each, result.estimate, parameters) for each in quantities(result) if each.name in _NAMES)
 
 
-def _one_shown(found: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
+def _one_shown(quantity: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
     """Return one quantity with its σ, progress to the goal, and the missing motion."""
-    if found.name == "scale":
+    if quantity.name == "scale":
         unit, prior = 100.0, parameters.initial_std_scale
     else:
         unit, prior = math.degrees(1.0), parameters.initial_std_misalignment
-    missing = (entry.missing for entry in estimate.observability if entry.axis == found.name and entry.missing)
-    needs = "" if found.shown else next(missing, MODELS[estimate.model].shown_by[found.name])
+    missing = (entry.missing for entry in estimate.observability if entry.axis == quantity.name and entry.missing)
+    needs = "" if quantity.shown else next(missing, MODELS[estimate.model].shown_by[quantity.name])
     fine = PredictedDrift.goals(parameters).side / KM
-    way = math.log(prior * unit / max(found.std, 1e-12)) / max(math.log(prior / fine), 1e-9)
-    return Shown(found.name, found.unit.strip(), found.std, min(1.0, max(0.0, way)), needs)
+    way = math.log(prior * unit / max(quantity.std, 1e-12)) / max(math.log(prior / fine), 1e-9)
+    return Shown(quantity.name, quantity.unit.strip(), quantity.std, min(1.0, max(0.0, way)), needs)

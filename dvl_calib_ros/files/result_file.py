@@ -168,9 +168,11 @@ def _found_quantities(result: Result) -> dict[str, str]:
     return found
 
 
-def _in_words(found: Quantity) -> str:
-    unit = found.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
-    return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not observable in this data)")
+def _in_words(quantity: Quantity) -> str:
+    unit = quantity.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
+    return f"{quantity.value:.2f} +- {quantity.std:.2f} {unit}" + (
+        "" if quantity.shown else " (not observable in this data)"
+    )
 
 
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:

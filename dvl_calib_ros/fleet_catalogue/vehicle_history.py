@@ -199,24 +199,24 @@ def _average_days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
     return found
 
 
-def _split_at_moves(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
-    """Split the recordings of one day where the mounting moved."""
-    compared = _compare_if_several([each for each, _ in own])
+def _split_at_moves(recordings: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
+    """Split the recordings of one day where the mounting moved. Each is (calibration, covariance of it alone)."""
+    compared = _compare_if_several([calibration for calibration, _ in recordings])
     starts = [] if compared is None else [change.first_after.name for change in compared.moved]
     parts: list[list[tuple[Extrinsics, Array]]] = [[]]
-    for each in own:
-        if each[0].name in starts and parts[-1]:
+    for calibration, alone in recordings:
+        if calibration.name in starts and parts[-1]:
             parts.append([])
-        parts[-1].append(each)
+        parts[-1].append((calibration, alone))
     return parts
 
 
-def _average_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
+def _average_day(recordings: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
     """Average a day's recordings, adding the variation between days once."""
-    of_days = [each.covariance - alone for each, alone in own]
-    together = fused([replace(each, covariance=alone) for each, alone in own])
+    of_days = [recording.covariance - alone for recording, alone in recordings]
+    together = fused([replace(recording, covariance=alone) for recording, alone in recordings])
     covariance = together.covariance + max(of_days, key=np.trace)
-    name = own[0][0].name.rpartition("/")[2] if len(own) == 1 else f"{len(own)} recordings"
+    name = recordings[0][0].name.rpartition("/")[2] if len(recordings) == 1 else f"{len(recordings)} recordings"
     return replace(together, name=name, covariance=covariance)
 
 

@@ -375,12 +375,12 @@ class MessageDecoder:
         if self.imu_alignment.is_identity and frame_id.lstrip("/") != base.lstrip("/"):
             self._report("imu frame", finding("IMU_FRAME", frame_id=frame_id, base=base))
 
-    def _report(self, kind: str, found: Reason) -> None:
+    def _report(self, kind: str, reason: Reason) -> None:
         """Remember a problem, and report it if it is the first of its kind."""
         is_new = kind not in self.problems
-        self.problems[kind] = found
+        self.problems[kind] = reason
         if is_new:  # alternating frames or ever new garbage must not be reported with every message
-            self._on_problem(str(found))
+            self._on_problem(str(reason))
 
 
 def _east_north_up(

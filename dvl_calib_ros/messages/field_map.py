@@ -222,21 +222,21 @@ def misfit(text: str, store: Typestore, msgtype: str) -> str:
     return ""
 
 
-def _fits(fields: _Fields, key: str, found: Description, count: int) -> tuple[bool, str]:
+def _fits(fields: _Fields, key: str, description: Description, count: int) -> tuple[bool, str]:
     """Return whether a field's kind is allowed for a key, and the name of the allowed kind."""
     if key == "frame":
-        return found == (BASE, ("string", 0)), "text"
+        return description == (BASE, ("string", 0)), "text"
     if key == "stamp":
-        return fields.is_number(found) or "nanosec" in fields.of(found), "a time, or seconds"
+        return fields.is_number(description) or "nanosec" in fields.of(description), "a time, or seconds"
     if key == "variance" and count == 1:
-        return fields.is_number(found) or _is_three(fields, found), "a number, a vector or an array"
+        return fields.is_number(description) or _is_three(fields, description), "a number, a vector or an array"
     if key == "velocity" and count == 1:
-        return _is_three(fields, found), "a vector"
-    return fields.is_number(found), "a number"
+        return _is_three(fields, description), "a vector"
+    return fields.is_number(description), "a number"
 
 
-def _is_three(fields: _Fields, found: Description) -> bool:
-    return fields.is_vector(found) or fields.is_array(found)
+def _is_three(fields: _Fields, description: Description) -> bool:
+    return fields.is_vector(description) or fields.is_array(description)
 
 
 def _listed(fields: _Fields, description: Description) -> str:

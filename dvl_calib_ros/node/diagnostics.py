@@ -213,10 +213,10 @@ def diagnose(
     return status
 
 
-def _status_level(found: Sequence[Reason]) -> bytes:
-    if not found:
+def _status_level(reasons: Sequence[Reason]) -> bytes:
+    if not reasons:
         return DiagnosticStatus.OK
-    return DiagnosticStatus.ERROR if found[0].severity is Severity.ERROR else DiagnosticStatus.WARN
+    return DiagnosticStatus.ERROR if reasons[0].severity is Severity.ERROR else DiagnosticStatus.WARN
 
 
 def _restart_advice(counts: Counts) -> list[Reason]:

@@ -78,9 +78,9 @@ class Recording:
     waters: tuple[OfWater, ...] = ()
     field_maps: Mapping[str, str] = field(default_factory=dict)
 
-    def register_as(self, found: Registration, topics: Topics, parameters: Parameters) -> None:
+    def register_as(self, registration: Registration, topics: Topics, parameters: Parameters) -> None:
         """Cache a registration for these topics and parameters."""
-        self.registrations[self._registration_key(topics, parameters)] = found
+        self.registrations[self._registration_key(topics, parameters)] = registration
 
     def registration(self, topics: Topics, parameters: Parameters) -> Registration | None:
         """Return the cached registration for the same topics and parameters, or None."""
@@ -201,10 +201,12 @@ class Held:
     lacks_definition: bool
 
 
-def _joined(found: Sequence[Stretch]) -> Streams:
-    if not found:
+def _joined(stretches: Sequence[Stretch]) -> Streams:
+    if not stretches:
         return Streams(*map(no_samples, (Stream.DVL, Stream.REFERENCE, Stream.IMU)))
-    return Streams(*(one.joined(*others) for one, *others in zip(*(stretch.streams for stretch in found), strict=True)))
+    return Streams(
+        *(one.joined(*others) for one, *others in zip(*(stretch.streams for stretch in stretches), strict=True))
+    )
 
 
 def open_recording(
@@ -220,7 +222,7 @@ def open_recording(
     on_progress: receives the share (0..1) read.
     """
     parameters = parameters or Parameters()
-    each = []
+    recordings = []
     with ExitStack() as stack:
         # a fault of the last bag is reported before reading the first
         bags = [stack.enter_context(open_bags([path], parameters.dvl_fields)) for path in paths]
@@ -229,43 +231,43 @@ def open_recording(
             def progress(share: float, index: int = index) -> None:
                 on_progress((index + share) / len(paths))
 
-            each.append(_read(path, bag, topics, parameters, progress))
-    return together(each)
+            recordings.append(_read(path, bag, topics, parameters, progress))
+    return together(recordings)
 
 
-def together(each: Sequence[Recording]) -> Recording:
+def together(recordings: Sequence[Recording]) -> Recording:
     """Join several recordings."""
-    if len(each) == 1:
-        return each[0]
+    if len(recordings) == 1:
+        return recordings[0]
     counts: Counter[str] = Counter()
-    for one in each:
-        counts.update(one.counts)
-    names = dict.fromkeys(name for one in each for name in one.types)
-    held = {name: [one.held[name] for one in each if name in one.held] for name in names}
+    for recording in recordings:
+        counts.update(recording.counts)
+    names = dict.fromkeys(name for recording in recordings for name in recording.types)
+    held = {name: [recording.held[name] for recording in recordings if name in recording.held] for name in names}
     return Recording(
-        tuple(path for one in each for path in one.paths),
-        {name: kind for one in each for name, kind in one.types.items()},
+        tuple(path for recording in recordings for path in recording.paths),
+        {name: kind for recording in recordings for name, kind in recording.types.items()},
         {
             name: Held(frozenset().union(*(held.types for held in owns)), any(held.lacks_definition for held in owns))
             for name, owns in held.items()
             if owns
         },
         counts,
-        tuple(span for one in each for span in one.file_spans_ns),
-        tuple(note for one in each for note in one.notes),
-        _renumbered(each, names),
-        tuple(transform for one in each for transform in one.transforms),
-        tuple(dict.fromkeys(text for one in each for text in one.descriptions)),
-        tuple(each),
-        waters=_joined_waters(each),
-        field_maps={topic: text for one in each for topic, text in one.field_maps.items()},
+        tuple(span for recording in recordings for span in recording.file_spans_ns),
+        tuple(note for recording in recordings for note in recording.notes),
+        _renumbered(recordings, names),
+        tuple(transform for recording in recordings for transform in recording.transforms),
+        tuple(dict.fromkeys(text for recording in recordings for text in recording.descriptions)),
+        tuple(recordings),
+        waters=_joined_waters(recordings),
+        field_maps={topic: text for recording in recordings for topic, text in recording.field_maps.items()},
     )
 
 
-def _joined_waters(each: Sequence[Recording]) -> tuple[OfWater, ...]:
+def _joined_waters(recordings: Sequence[Recording]) -> tuple[OfWater, ...]:
     """Join the readings of the same topic."""
     found: dict[tuple[str, str], list[OfWater]] = {}
-    for reading in (reading for one in each for reading in one.waters):
+    for reading in (reading for recording in recordings for reading in recording.waters):
         found.setdefault((reading.topic, reading.kind), []).append(reading)
     return tuple(
         parts[0]._replace(values=np.concatenate([part.values for part in parts]), std=max(part.std for part in parts))
@@ -273,27 +275,29 @@ def _joined_waters(each: Sequence[Recording]) -> tuple[OfWater, ...]:
     )
 
 
-def _renumbered(each: Sequence[Recording], names: Collection[str]) -> dict[str, tuple[TopicColumns, ...]]:
+def _renumbered(recordings: Sequence[Recording], names: Collection[str]) -> dict[str, tuple[TopicColumns, ...]]:
     """Renumber the arrivals in all recordings by log time, and by recording at equal times."""
     arrivals, logs = [], []
-    for one in each:
-        found = [part.arrivals for parts in one.columns.values() for part in parts] or [_NOTHING]
+    for recording in recordings:
+        found = [part.arrivals for parts in recording.columns.values() for part in parts] or [_NOTHING]
         arrival, log_ns = (np.concatenate(column) for column in zip(*found, strict=True))
         order = np.argsort(arrival, kind="stable")
         arrivals.append(arrival[order])
         logs.append(log_ns[order])
     new_arrival = np.empty(sum(map(len, logs)), dtype=np.int64)
     new_arrival[np.argsort(np.concatenate(logs), kind="stable")] = np.arange(len(new_arrival))
-    columns: dict[str, list[TopicColumns]] = {name: [] for name in names if any(name in one.columns for one in each)}
+    columns: dict[str, list[TopicColumns]] = {
+        name: [] for name in names if any(name in recording.columns for recording in recordings)
+    }
     at = 0
-    for one, arrival in zip(each, arrivals, strict=True):
+    for recording, arrival in zip(recordings, arrivals, strict=True):
         new_arrivals = new_arrival[at : at + len(arrival)]
         at += len(arrival)
 
         def renumbered(old_arrivals: Stamps, arrival: Stamps = arrival, new_arrivals: Stamps = new_arrivals) -> Stamps:
             return np.asarray(new_arrivals[np.searchsorted(arrival, old_arrivals)])
 
-        for name, parts in one.columns.items():
+        for name, parts in recording.columns.items():
             columns[name] += [part.arriving(renumbered) for part in parts]
     return {name: tuple(parts) for name, parts in columns.items()}
 
@@ -512,7 +516,7 @@ def _turn_rates(stamps_ns: Stamps, quaternions: Array) -> Array:
     return rates
 
 
-def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> None:
+def check_topics(recording: Recording, topics: Topics, reasons: list[Reason]) -> None:
     """Raise InputError unless there is a readable DVL; other missing data are added to `found`."""
     present, where = recording.types, recording.where
     if not present:
@@ -523,11 +527,11 @@ def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> N
         listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
         option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
         raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
-    _check_types(recording, topics, found)
+    _check_types(recording, topics, reasons)
     if not recording.counts[topics.dvl]:
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
     if topics.gnss not in (*present, NONE):
-        found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
+        reasons.append(finding("BAG_NO_GNSS", topic=topics.gnss))
 
 
 def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | None) -> list[Reason]:
@@ -543,7 +547,7 @@ def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | Non
     return [finding("BAG_NO_IMU", what=what)]
 
 
-def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> None:
+def _check_types(recording: Recording, topics: Topics, reasons: list[Reason]) -> None:
     """Raise InputError for a topic of another or of several types; add missing definitions to `found`."""
     for role, wanted in _WANTED.items():
         name = getattr(topics, role)
@@ -557,7 +561,7 @@ def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> N
         if len(held.types) > 1:
             raise InputError(f"{recording.where}: topic {name} holds {types}; replay bags of one type together")
         if held.lacks_definition:
-            found.append(finding("BAG_NO_DEFINITION", type=types))
+            reasons.append(finding("BAG_NO_DEFINITION", type=types))
 
 
 _WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}

@@ -93,7 +93,7 @@ def disturbed(
     return velocity
 
 
-def injection_document(each: Injection) -> dict[str, object]:
+def injection_document(injection: Injection) -> dict[str, object]:
     """Return plain data as in the diagnosis' JSON; null means no limit."""
-    values = {name: value if math.isfinite(value) else None for name, value in each.values.items()}
-    return {"name": each.effect.name, "parameters": values}
+    values = {name: value if math.isfinite(value) else None for name, value in injection.values.items()}
+    return {"name": injection.effect.name, "parameters": values}

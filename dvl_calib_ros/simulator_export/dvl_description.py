@@ -167,10 +167,10 @@ def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
 
 
 def _others(
-    document: Mapping[str, Any], found: Mapping[str, Mapping[str, float]], sizes: Mapping[str, float]
+    document: Mapping[str, Any], effects: Mapping[str, Mapping[str, float]], sizes: Mapping[str, float]
 ) -> tuple[Other, ...]:
     """Return effects and noise without number of their own in a description, with their sizes."""
-    systematic = {name: dict(values) for name, values in found.items() if name not in GIVEN_AS_NUMBERS}
+    systematic = {name: dict(values) for name, values in effects.items() if name not in GIVEN_AS_NUMBERS}
     dvl = document["dvl"]
     for name, parameter, before in (
         ("dvl_time_offset", "seconds", dvl["time_offset_s"]),

@@ -119,13 +119,13 @@ def _wald(values: Array, covariance: Array, dof: int) -> float:
     return float(f_distribution.sf(statistic, p, max(dof - p, 2)))
 
 
-def is_there(own: Size, other: Size) -> bool:
+def is_there(size: Size, against_size: Size) -> bool:
     """Return whether a side has an effect: found there, or significant and not small against the other side's."""
-    if own.found:
+    if size.found:
         return True
-    value, against = own.mean[0], other.mean[0]
+    value, against = size.mean[0], against_size.mean[0]
     worth_it = float(np.linalg.norm(value)) > WORTH_IT * float(np.linalg.norm(against))
-    return worth_it and own.p_absent() < THERE
+    return worth_it and size.p_absent() < THERE
 
 
 def smallest_difference(vehicle: Size, simulator: Size, n_claims: int) -> dict[str, float]:
@@ -173,8 +173,8 @@ def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
     return fitter.fit(fit.hypothesis.with_effects(chosen, fit.n_recordings, start), fit.noise)
 
 
-def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
-    """Return every effect of a fit by name. found: compared names in the side's own diagnosis."""
+def sizes(selection: EffectSelection, fit: Fit, found_names: Sequence[str]) -> dict[str, Size]:
+    """Return every effect of a fit by name. found_names: effects named by the diagnosis of this side."""
     block = blocks_of(selection.fitter.problem)
     covariance = fit.covariance(block)
     dof = int(block.max()) + 1
@@ -190,7 +190,7 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
             continue
         stacked = vector[part].reshape(n_recordings, n_parameters)
         recordings = tuple(selection.fitter.problem.recordings[i].name for i in owners if i is not None)
-        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found, recordings)
+        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found_names, recordings)
     return result
 
 

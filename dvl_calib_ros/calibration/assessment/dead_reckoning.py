@@ -158,7 +158,7 @@ def dead_reckoned(
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
     n = len(recording.dvl.times)
-    before, after = _Level.of(n), _Level.of(n, whole=True)
+    before, after = _ErrorTable.of(n), _ErrorTable.of(n, whole=True)
     before.fill(recording, np.arange(n), NO_TERMS, parameters)
     for k, terms_of_fold in enumerate(terms):
         after.fill(recording, np.flatnonzero(folds == k), terms_of_fold, parameters)
@@ -171,7 +171,7 @@ def dead_reckoned(
     distance = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
     if not len(distance) or distance[-1] < SHORTEST_M:
         return None
-    errors = [each.error[used, axes] for each in (before, after)]
+    errors = [before.error[used, axes], after.error[used, axes]]
     track_errors = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
     if slow is not None and recording.reference.in_body.all():
         slow = slow._replace(heading=0.0)  # body velocities need no heading
@@ -200,7 +200,7 @@ def dead_reckoned(
     )
 
 
-class _Level(NamedTuple):
+class _ErrorTable(NamedTuple):
     """Reference velocity and DVL error of N samples.
 
     velocity, error: (N, 4) m/s, forward, port, east, north, the latter two where oriented (N,).
@@ -217,11 +217,11 @@ class _Level(NamedTuple):
     whole: tuple[Array, ...]
 
     @staticmethod
-    def of(n: int, *, whole: bool = False) -> _Level:
+    def of(n: int, *, whole: bool = False) -> _ErrorTable:
         """Return an empty table of n samples."""
         error = np.empty((n, 3))
         kept = (np.empty((n, 3, 3)), np.empty((n, 3)), error, np.empty((n, 3))) if whole else ()
-        return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
+        return _ErrorTable(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
 
     def fill(self, recording: ThinnedRecording, rows: Index, terms: Terms, parameters: Parameters) -> None:
         """Fill in some samples, corrected by these terms."""
@@ -240,9 +240,9 @@ class _Level(NamedTuple):
                 columns[part, 2:] = np.matmul(data.rotation_enu_from_body, body[..., None])[:, :2, 0]
 
 
-def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Parameters) -> ResidualTrend | None:
+def _followed(recording: ThinnedRecording, after: _ErrorTable, use: Index, p: Parameters) -> ResidualTrend | None:
     """Return `residual_trend` of the samples in use; None without turn rates, as lever arms then look like signals."""
-    rotation, velocity, error, rates = (each[use] for each in after.whole)
+    rotation, velocity, error, rates = (column[use] for column in after.whole)
     if np.isnan(rates).any():
         return None
     interval_s = float(median(np.diff(recording.reference.times)))
@@ -370,7 +370,7 @@ def doubts(
     """
     reasons = [finding("IMU_LEVEL")] if is_level else []
     if not suggested:
-        reasons += [each.weighed(Severity.MARGINAL) for each in lever_arm_warnings(finders, parameters)]
+        reasons += [reason.weighed(Severity.MARGINAL) for reason in lever_arm_warnings(finders, parameters)]
     if navigation is None:
         return reasons
     bed_reason = moving_bed(navigation.followed, estimate)

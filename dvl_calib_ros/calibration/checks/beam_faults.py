@@ -105,12 +105,12 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     return BeamFault(abs(share), std, (AZIMUTHS_DEG[beam] + 180.0 * (share < 0.0)) % 360.0, relative)
 
 
-def beam_warning(found: BeamFault | None, accepted: float) -> list[Reason]:
+def beam_warning(fault: BeamFault | None, accepted: float) -> list[Reason]:
     """Return the reason against a calibration by a faulty beam; its roll and yaw are wrong by several σ.
 
     accepted: error of the velocity ahead, as a share of the speed, up to which a beam is not reported.
     """
-    if found is None or found.share < Z_FIFTY_TESTS * found.std or found.least < accepted:
+    if fault is None or fault.share < Z_FIFTY_TESTS * fault.std or fault.least < accepted:
         return []
-    percent, std = 100.0 * found.share, 100.0 * found.std
-    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.REJECT)]
+    percent, std = 100.0 * fault.share, 100.0 * fault.std
+    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=fault.azimuth_deg).weighed(Severity.REJECT)]

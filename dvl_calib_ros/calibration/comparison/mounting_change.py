@@ -195,9 +195,9 @@ class Comparison(Answering):
         return self.verdict == "same"
 
 
-def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
+def contradicts(result: Extrinsics, initial: Extrinsics) -> Difference | None:
     """Return the difference of an initial calibration from another at 1 %; None if they agree."""
-    difference = Difference.between(initial, found)
+    difference = Difference.between(initial, result)
     return difference if difference.chance(MOUNTING) < CHANCE else None
 
 

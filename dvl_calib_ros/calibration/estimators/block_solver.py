@@ -204,15 +204,15 @@ class BlockSolver:
             measured=measured, fold=folds_of(streams.reference_ns, self._parameters),
         )  # fmt: skip
 
-    def _compare_noise(self, streams: Cleaned, seen: InBody) -> None:
-        """Add a block's streams to `_shared_noise`. seen: its references in body axes."""
-        variance = np.diagonal(seen.noise, axis1=1, axis2=2)
-        known = seen.known[:, None] & (variance < MEASURED_BELOW)
+    def _compare_noise(self, streams: Cleaned, references: InBody) -> None:
+        """Add a block's streams to the test of shared noise. references: of the block, in body axes."""
+        variance = np.diagonal(references.noise, axis1=1, axis2=2)
+        known = references.known[:, None] & (variance < MEASURED_BELOW)
         self._seen_ahead = bool(known[:, 0].any()) or self._seen_ahead
         self._seen_upwards = bool(known[:, 2].any()) or self._seen_upwards
         at = streams.own_dvl
         in_the_body = streams.dvl.velocity[at] @ self._parameters.rotation_dvl_from_body
-        reference = np.where(known, seen.velocity, np.nan)
+        reference = np.where(known, references.velocity, np.nan)
         # at the original stamps, where filter output follows its input
         p = self._parameters
         times, reference_times = streams.dvl.times[at] + p.dvl_time_offset, streams.reference.times

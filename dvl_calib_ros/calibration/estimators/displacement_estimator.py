@@ -76,14 +76,14 @@ class HeldOutLegs(NamedTuple):
 class Displacements(Estimator):
     """Estimator of `positions`, which collects dead reckoning and fixes and has them solved."""
 
-    def __init__(self, given: EstimatorSetup) -> None:
+    def __init__(self, setup: EstimatorSetup) -> None:
         """Start from the prior of its states."""
-        self._model, self._parameters, self._aligner = given.model, given.parameters, given.aligner
-        self._start = given.initial or prior(given.model, given.parameters)
-        self._on_look = given.on_evidence
-        self._worker = AtOnce() if given.worker is None else given.worker
-        self._is_asked = are_positions(given.parameters)
-        self._reckoning = DeadReckoning(given.parameters.rotation_dvl_from_body, 1e-9 * given.aligner.lag_ns)
+        self._model, self._parameters, self._aligner = setup.model, setup.parameters, setup.aligner
+        self._start = setup.initial or prior(setup.model, setup.parameters)
+        self._on_look = setup.on_evidence
+        self._worker = AtOnce() if setup.worker is None else setup.worker
+        self._is_asked = are_positions(setup.parameters)
+        self._reckoning = DeadReckoning(setup.parameters.rotation_dvl_from_body, 1e-9 * setup.aligner.lag_ns)
         self._n_taken = 0
         self._first_ns: int | None = None
         self._next_ns = self._oriented_ns = 0

@@ -87,12 +87,12 @@ class _NewestBlocks:
         for stream in self._streams:
             stream.reserve((KEPT_BLOCKS + 1) * ROWS_PER_BLOCK)
 
-    def add(self, kept: ThinnedBlock) -> None:
+    def add(self, block: ThinnedBlock) -> None:
         """Add a block, and drop the oldest beyond `KEPT_BLOCKS`."""
-        r = kept.reference
+        r = block.reference
         variance = np.diagonal(r.noise, axis1=1, axis2=2)
-        own_noise = np.full(len(kept.dvl.times), np.trace(kept.noise_dvl))
-        columns = (*kept.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), kept.imu
+        own_noise = np.full(len(block.dvl.times), np.trace(block.noise_dvl))
+        columns = (*block.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), block.imu
         for stream, own in zip(self._streams, columns, strict=True):
             at = stream.extend(len(own[0]))
             for name, values in zip(stream.LAYOUT, own, strict=True):
@@ -162,9 +162,9 @@ class RegistrationSchedule:
         self._contradicted: RegistrationResult | None = None  # of an earlier day with a contradiction
         self._latest = RegistrationResult()
 
-    def add(self, kept: ThinnedBlock, frames: Codes, from_ns: int) -> None:
+    def add(self, block: ThinnedBlock, frames: Codes, from_ns: int) -> None:
         """Add a block's streams. frames: (J,) declared frame codes of its references. from_ns: the block's start."""
-        self._newest.add(kept)
+        self._newest.add(block)
         self._declared += np.bincount(frames, minlength=len(FRAMES))
         self._blocks += 1
 

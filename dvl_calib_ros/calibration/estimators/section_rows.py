@@ -69,7 +69,7 @@ class SectionRows:
 
 
 def effects_gram(
-    part: SectionRows, velocities: Callable[[Array], Array], x: Array, single: Array, white: Array, slow: SlowErrors
+    section: SectionRows, velocities: Callable[[Array], Array], x: Array, single: Array, white: Array, slow: SlowErrors
 ) -> Array:
     """Return the Gram matrix (21 + k, 21 + k) of a section over [states, effects, residual], without slow errors.
 
@@ -77,9 +77,9 @@ def effects_gram(
     x: (20,) point of linearisation.
     single, white: (3,) variances.
     """
-    bins = part.with_effects(velocities).bins(single)
+    bins = section.with_effects(velocities).bins(single)
     k = bins.rows.shape[2] - WIDTH
-    gram = gram_of(bins, white, np.append(x, np.zeros(k)), part.slope_variance)
+    gram = gram_of(bins, white, np.append(x, np.zeros(k)), section.slope_variance)
     return np.asarray(Chain.begun(slow, k).after(gram, BLOCK_S, slow).ended().gram[0])
 
 

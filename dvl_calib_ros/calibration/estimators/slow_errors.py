@@ -173,9 +173,9 @@ class Chain(NamedTuple):
     log_determinant: Array
 
     @staticmethod
-    def begun(slow: SlowErrors, more: int = 0) -> Chain:
-        """Return the chain before the first section. more: number of columns tested in addition to the states."""
-        width = SLOW + N_STATE + more + 1
+    def begun(slow: SlowErrors, n_tested: int = 0) -> Chain:
+        """Return the chain before the first section. n_tested: number of columns tested in addition to the states."""
+        width = SLOW + N_STATE + n_tested + 1
         gram = np.zeros((len(slow.std), width, width))
         gram[:, np.arange(SLOW), np.arange(SLOW)] = slow.std**-2.0
         return Chain(gram, 2.0 * np.log(slow.std).sum(axis=1))

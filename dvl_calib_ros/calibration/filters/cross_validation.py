@@ -92,10 +92,10 @@ class FoldInformation:
         """Start from x (K, n), P (K, n, n) of the filter."""
         self.begin([start.information] * FOLDS)
 
-    def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
+    def begin(self, information: Sequence[tuple[Array, Array]]) -> None:
         """Restart from Λ (K, n, n) and Λx (K, n) without each fold."""
-        self._begin = known
-        self._summed = FoldSums(known[0][0].shape, known[0][1].shape)
+        self._begin = information
+        self._summed = FoldSums(information[0][0].shape, information[0][1].shape)
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples where models used them (K, N)."""

@@ -113,7 +113,7 @@ _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
 def fitting_configuration(
-    motion: MotionStreams, declared: VelocityFrame, given: Registration | None, parameters: Parameters
+    motion: MotionStreams, declared: VelocityFrame, registration: Registration | None, parameters: Parameters
 ) -> Reason | None:
     """Return the finding of a configuration that fits much better than the configured one, else None.
 
@@ -121,7 +121,7 @@ def fitting_configuration(
     ----------
     motion: Streams as configured.
     declared: Configured reference frame.
-    given: Registration of the motion as configured; None if it failed.
+    registration: Of the motion as configured; None if it failed.
     parameters: With the configured axes, mounting and lever arm.
     """
     if not all(motion.measured):
@@ -134,14 +134,16 @@ def fitting_configuration(
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
     curves, misfit_as_given = Curves(motion), 1.0
-    if given is not None:
-        angle = _significant_angle(given.rotation_body_from_dvl, nominal, given.turn_std)
-        misfit_as_given = _misfit_with(given.residual, given.scale, angle)
+    if registration is not None:
+        angle = _significant_angle(registration.rotation_body_from_dvl, nominal, registration.turn_std)
+        misfit_as_given = _misfit_with(registration.residual, registration.scale, angle)
     if misfit_as_given < WRONG_FROM:
-        assert given is not None
+        assert registration is not None
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
         max_ratio = min(MAX_SIGN_RATIO, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
-        return wrong_axes(motion, curves, nominal, lever_arm, max_ratio * given.spread, parameters.dvl_axes, SIGNS)
+        return wrong_axes(
+            motion, curves, nominal, lever_arm, max_ratio * registration.spread, parameters.dvl_axes, SIGNS
+        )
     fits = {}
     for frame in _FRAMES:
         in_frame = _fit_in_frame(MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS), nominal)

@@ -113,12 +113,12 @@ class ThinnedRecording(NamedTuple):
     imu: ImuColumns
 
     @staticmethod
-    def of(kept: Sequence[ThinnedBlock]) -> ThinnedRecording:
+    def of(blocks: Sequence[ThinnedBlock]) -> ThinnedRecording:
         """Return the joined blocks."""
-        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(block.dvl for block in kept), strict=True)))
-        noise = np.concatenate([np.full(len(block.dvl.times), np.trace(block.noise_dvl)) for block in kept])
-        reference = zip(*(block.reference for block in kept), strict=True)
-        imu = zip(*(block.imu for block in kept), strict=True)
+        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(block.dvl for block in blocks), strict=True)))
+        noise = np.concatenate([np.full(len(block.dvl.times), np.trace(block.noise_dvl)) for block in blocks])
+        reference = zip(*(block.reference for block in blocks), strict=True)
+        imu = zip(*(block.imu for block in blocks), strict=True)
         return ThinnedRecording(
             dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
         )

@@ -266,7 +266,9 @@ class Aligner(LiveAlignment):
         self._n_messages += len(dvl)
         return True
 
-    def _count_columns(self, valid: ScreenedStreams, chunk: OrderedStreams, found: Decisions, events: Events) -> None:
+    def _count_columns(
+        self, valid: ScreenedStreams, chunk: OrderedStreams, decisions: Decisions, events: Events
+    ) -> None:
         """Count messages that are invalid, refused or not in order."""
         for block, is_valid, order in zip(
             valid.streams, valid[1:4], (chunk.dvl, chunk.reference, chunk.imu), strict=True
@@ -285,8 +287,8 @@ class Aligner(LiveAlignment):
         stamps_ns = reference.stamps_ns[valid.reference] - self._clocks.reference_ns
         if len(stamps_ns):
             at = np.searchsorted(events.arrival, reference.arrival[valid.reference])
-            decided = np.concatenate([[self.partners.decided_ns], found.stamps_ns])
-            before = decided[np.searchsorted(found.paired_at, at)]
+            decided = np.concatenate([[self.partners.decided_ns], decisions.stamps_ns])
+            before = decided[np.searchsorted(decisions.paired_at, at)]
             add_count(self.tally["reference"], "late", int(np.count_nonzero(stamps_ns < before)))
 
     def _append_columns(self, valid: ScreenedStreams, chunk: OrderedStreams, events: Events) -> None:
@@ -365,7 +367,7 @@ def counted(
 
 
 def counts_by_use(
-    counts: Mapping[str, Mapping[str, int]], needs: Needs, given: int, used: int, gated: int
+    counts: Mapping[str, Mapping[str, int]], needs: Needs, passed: int, used: int, gated: int
 ) -> dict[str, int]:
     """Return the number of received DVL samples in each state, for one model; the sum is ``received``.
 
@@ -379,7 +381,7 @@ def counts_by_use(
         Result of `counted`.
     needs
         Input that the model requires of a sample.
-    given
+    passed
         Number of samples passed to the model.
     used, gated
         Number of samples that the model used and gated.
@@ -387,7 +389,7 @@ def counts_by_use(
     dvl, pairing = counts["dvl"], counts["pairing"]
     unusable, unpaired, waiting = dvl["accepted"] - dvl["usable"] - dvl["awaiting_imu"], 0, 0
     if needs is Needs.REFERENCE:  # unusable rows are paired, too
-        unusable, unpaired, waiting = pairing["paired"] - given, pairing["unpaired"], pairing["awaiting_reference"]
+        unusable, unpaired, waiting = pairing["paired"] - passed, pairing["unpaired"], pairing["awaiting_reference"]
     elif needs is Needs.ATTITUDE:
         unpaired, waiting = pairing["not_oriented"], pairing["awaiting_attitude"]
     elif needs is Needs.ATTITUDE_IF_KNOWN:
@@ -397,7 +399,7 @@ def counts_by_use(
         "unusable": unusable,
         "unpaired": unpaired,
         "waiting": dvl["held"] + dvl["awaiting_imu"] + waiting,
-        "gathered": given - used - gated,
+        "gathered": passed - used - gated,
         "used": used,
         "gated": gated,
     }
