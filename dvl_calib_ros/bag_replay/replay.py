@@ -403,6 +403,7 @@ def _feed_all(
     calibrator: Calibrator,
     on_progress: Callable[[float], None],
 ) -> None:
+    """Feed all samples to a calibrator in order of arrival. on_progress: receives the share (0..1) fed."""
     start_ns, end_ns = recording.span_ns
     streams = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     for stretch in recording.stretches(streams, decoder):

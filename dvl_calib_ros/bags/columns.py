@@ -240,6 +240,7 @@ class MessageColumns:
         return len(self._rows)
 
     def __getattr__(self, name: str) -> Any:
+        """Return a field of all messages as an array, or as further columns for a nested message."""
         layout, path = self._layout, self._prefix + name
         if path in layout.flags:
             return self._rows[path] != 0

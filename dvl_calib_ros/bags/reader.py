@@ -43,6 +43,7 @@ class BagReader:
     """
 
     def __init__(self, paths: Sequence[Path], known: Mapping[str, Sequence[str]] | None = None) -> None:
+        """Open the files of all recordings, and list their topics; close all again if one cannot be opened."""
         self.notes: list[str] = []
         self.decoder = Decoder(known)
         self._stack = ExitStack()

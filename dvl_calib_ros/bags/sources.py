@@ -152,6 +152,7 @@ class Source:
         batches: Batches,
         damage_noted: bool = False,
     ) -> None:
+        """Describe a recorded file; the arguments are those of the class."""
         self.path = path
         self.counts = counts
         self.span_ns = min(span_ns[0], LATEST_NS), min(span_ns[1], LATEST_NS)
@@ -385,6 +386,7 @@ class Database:
     """
 
     def __init__(self, path: Path) -> None:
+        """Count the messages of each channel, and find the first and the last log time (ns)."""
         self._path = path
         with closing(self._connection()) as connection:
             self._channels = _channels(connection)

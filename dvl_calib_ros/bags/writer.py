@@ -73,6 +73,7 @@ class BagWriter:
     def __init__(
         self, path: Path, storage: Storage = Storage.MCAP, compression: Compression = Compression.NONE
     ) -> None:
+        """Check the path and the combination of storage and compression; nothing is written before `__enter__`."""
         if os.path.lexists(path):  # also true for a dangling link
             raise InputError(f"{path}: exists already; give another name, or remove it first")
         if storage is Storage.SQLITE3 and compression is Compression.CHUNK:
@@ -93,6 +94,7 @@ class BagWriter:
         self._attachments.append((name, media_type, data))
 
     def __enter__(self) -> BagWriter:
+        """Create the bag; remove it again if that fails."""
         try:
             self._new_part()
         except WriterError as error:  # created by another process since the check
@@ -107,6 +109,7 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Finish the bag and add its attachments; remove it if anything failed."""
         try:
             for part in self._parts:
                 part.writer.__exit__(kind, error, trace)

@@ -191,6 +191,7 @@ class Estimates:
         models: Sequence[str],
         parameters: Parameters,
     ) -> None:
+        """Start without estimates; the arguments are those of the class."""
         self.estimators, self.further, self.parameters = estimators, further, parameters
         self._models = models
         self._day_covariances: dict[str, Array] = {}

@@ -93,6 +93,7 @@ class Calibrator:
         worker: Executor | None = None,
         models: Collection[str] = tuple(MODELS),
     ) -> None:
+        """Check the configuration and build the alignment, the filters and the nonlinear estimators."""
         if BROKEN:
             raise ParameterError(BROKEN[0])
         if parameters.prior_source == "reference" and prior_sway_heave is None:

@@ -54,6 +54,7 @@ class BagPlayer:
         reliability: Any = ReliabilityPolicy.RELIABLE,
         clock_hz: float = 0.0,
     ) -> None:
+        """Create a publisher for each topic to play. reliability: QoS policy of the publishers."""
         self._paths = paths
         self._reliable = reliability == ReliabilityPolicy.RELIABLE
         self._publishers: dict[str, Any] = {}

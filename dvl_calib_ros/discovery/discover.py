@@ -106,6 +106,7 @@ class _Search:
     """One search; the findings are collected in attributes."""
 
     def __init__(self, survey: Survey, parameters: Parameters, given: Given, where: str) -> None:
+        """Read the transforms. given: what the user set. where: name of the recording in messages."""
         self._survey, self._parameters, self._given, self._where = survey, parameters, given, where
         used = parameters.use_transforms
         self._tree = FrameTree.of(survey.transforms if used else (), survey.descriptions if used else ())

@@ -67,6 +67,7 @@ class Catalogue:
     """
 
     def __init__(self, folder: Path):
+        """Create the folder, and define the columns of its files."""
         self._arrow = _arrow()
         self.folder = folder
         self.notes: list[str] = []

@@ -230,6 +230,7 @@ class ImportOptions:
     compression: Compression = Compression.NONE
 
     def __post_init__(self) -> None:
+        """Check columns, start, frames and standard deviations. Raises InputError."""
         for name, std in (("--dvl-std", self.dvl_std), ("--gnss-std", self.gnss_std)):
             if not 0.0 <= std <= 100.0:
                 raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")

@@ -200,6 +200,7 @@ class MessageDecoder:
     """
 
     def __init__(self, parameters: Parameters, on_problem: Callable[[str], None] = lambda _: None) -> None:
+        """Select the conversion of each type. on_problem: receives the text of each new problem."""
         self.parameters = parameters
         self.dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         self.reference_type = velocity_type("gnss_type", parameters.gnss_type)

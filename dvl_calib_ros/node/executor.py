@@ -27,6 +27,7 @@ class _Waiting:
     """Wait set with the node's current entities and a guard condition."""
 
     def __init__(self, node: CalibrationNode, woken: GuardCondition) -> None:
+        """Add all entities of the node to a new wait set. woken: guard condition that ends a wait."""
         self.inputs = list(node.inputs)
         others = [
             subscription

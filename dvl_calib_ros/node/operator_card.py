@@ -119,6 +119,7 @@ class Card:
     """Values of successive statuses. now_s: monotonic time."""
 
     def __init__(self, now_s: float) -> None:
+        """Start without statuses."""
         self._began_s = now_s
         self._received: deque[tuple[float, Mapping[str, int]]] = deque(maxlen=RATED_OVER)
         self._came_s: dict[str, float] = {}

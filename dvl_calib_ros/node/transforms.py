@@ -29,6 +29,7 @@ class Transforms:
     """Subscriber to transforms. `n_messages` counts its messages, so that callers can skip an unchanged tree."""
 
     def __init__(self, node: Node) -> None:
+        """Subscribe to /robot_description, and to /tf_static if its message package is installed."""
         self._transforms: dict[str, Any] = {}
         self._own: deque[Any] = deque(maxlen=OWN_TRANSFORMS)
         self._description = ""
@@ -78,6 +79,7 @@ class MountingOutput:
     """
 
     def __init__(self, node: Any, publisher: Any, broadcasts: bool, warn: Callable[[str], None]) -> None:
+        """Set up. broadcasts: also publish a TF transform. warn: receives a warning if tf2_ros is missing."""
         self._publisher = publisher
         self._broadcaster: Any = None
         self._unknown_in = ""

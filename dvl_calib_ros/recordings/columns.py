@@ -243,6 +243,7 @@ class Collector:
     """Collector of a topic's messages. expected: number of messages. parameters: for the type's validity rules."""
 
     def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
+        """Reserve the columns. expected: number of messages. parameters: for the validity rules of the message type."""
         self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
         shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "extra": (extra_width(msgtype),)}
         self._laid = {name: GrowingRows(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}

@@ -54,6 +54,7 @@ class Follower:
     """
 
     def __init__(self, scenario: Scenario, start_ns: int = START_NS) -> None:
+        """Create the sensors and noise processes with the seeds of `simulate`. start_ns: stamp of time 0."""
         self._scenario = scenario
         self._late_ns = start_ns - START_NS
         seeds = Seeds.of(scenario)

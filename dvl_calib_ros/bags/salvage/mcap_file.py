@@ -308,6 +308,13 @@ class _FileWalk:
     def __init__(
         self, file: BinaryIO, size: int, tables: Tables, damage: Damage, indexes: Collection[ChunkIndex]
     ) -> None:
+        """Start before the first record.
+
+        file, size: the MCAP file and its length, bytes.
+        tables: known schemas and channels.
+        damage: receives the damage found.
+        indexes: chunk indexes of the summary, if readable.
+        """
         self._file, self._size, self._tables, self._damage = file, size, tables, damage
         self._indexes = {index.chunk_start_offset: index for index in indexes}
         self._may_hold_chunks = True

@@ -74,6 +74,7 @@ class Tables:
     """
 
     def __init__(self, summary: Summary | None) -> None:
+        """Start from the file's summary; None if it is lost."""
         self.schemas: dict[int, Schema] = dict(summary.schemas) if summary else {}
         self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
         self.eras: set[int] = set()

@@ -117,6 +117,7 @@ class _Pages:
     """
 
     def __init__(self, file: BinaryIO, size: int) -> None:
+        """Read page size and count from the header; assume the default if it is damaged. size: of the file, bytes."""
         header = file.read(_FILE_HEADER).ljust(_FILE_HEADER, b"\0")
         (page_size,) = struct.unpack_from(">H", header, 16)
         page_size = 65536 if page_size == 1 else page_size

@@ -115,6 +115,12 @@ class Group:
         initial: Mapping[str, GaussianState] | None,
         verified: bool,
     ) -> None:
+        """Start the filters from their priors.
+
+        models: with equal needs, number of states and number of measured axes.
+        initial: initial states by model name.
+        verified: sum the information per fold for hold-out verification.
+        """
         self._parameters = parameters
         self._assembler = Assembler(models, parameters, initial)
         self._folds = FoldInformation(self._assembler.start) if verified else None

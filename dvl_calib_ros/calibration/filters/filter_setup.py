@@ -28,6 +28,7 @@ class Assembler:
     def __init__(
         self, models: Sequence[Model], parameters: Parameters, initial: Mapping[str, GaussianState] | None = None
     ) -> None:
+        """Stack the models' priors, gates and process noise. initial: states by model name, instead of the priors."""
         self.models = tuple(models)
         first = self.models[0]
         self._n, self._m, self._model_noise = first.n_state, first.n_measurement, first.noise

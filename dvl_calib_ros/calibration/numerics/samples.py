@@ -156,6 +156,7 @@ class SampleBlock:
     reasons: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check the type of the stamps and the shape of each column."""
         n = len(self.stamps_ns)
         shapes = {
             "values": (self.values.shape, (n, WIDTH[self.stream])),

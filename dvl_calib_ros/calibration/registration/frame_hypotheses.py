@@ -156,6 +156,7 @@ class Readings:
     """
 
     def __init__(self, motion: MotionStreams, position: Array) -> None:
+        """Select the moving DVL samples that have reference and attitude, with the reference at their times."""
         self._motion, self._position = motion, position
         self._motions: dict[Reading, MotionStreams] = {}
         self._fits: dict[Reading, MotionFit] = {}

@@ -71,6 +71,11 @@ class LiveAlignment:
         on_restart: Callable[[float], None] = lambda _: None,
         recordings_ns: Sequence[int] = (),
     ) -> None:
+        """Start without samples.
+
+        prior_sway_heave: (2,) m/s, prior for `prior_source: reference`.
+        recordings_ns: stamps between recordings.
+        """
         self.parameters = parameters
         self._prior_sway_heave = prior_sway_heave
         self._on_restart = on_restart

@@ -47,6 +47,13 @@ class Pairer:
         tally: Mapping[str, Counter[str]],
         prior_sway_heave: tuple[float, float] | None,
     ) -> None:
+        """Start without rows.
+
+        rows: table of the DVL samples.
+        reference, imu: recent samples of these streams.
+        tally: counters by stream and for pairing.
+        prior_sway_heave: (2,) m/s, prior for `prior_source: reference`.
+        """
         self._rows, self._reference, self._imu, self._tally = rows, reference, imu, tally
         self._has_lever_arm = any(parameters.lever_arm)
         self.needs_turn_rate = self._has_lever_arm or parameters.max_turn_rate > 0.0
