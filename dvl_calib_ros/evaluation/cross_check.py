@@ -203,7 +203,12 @@ def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Giv
 
 
 def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
-    """Replay one bag and collect its corrections and the moments of its paired velocities."""
+    """Replay one bag. Return its corrections, the moments of its paired velocities, and what the cross-check needs.
+
+    named: parameters given by the user, before discovery.
+    models: names of the models whose correction matrices (3, 3) are collected; nan if a model used no sample.
+    given: topics and parameters that discovery must keep.
+    """
     opened = open_recording([bag], None, named)
     discovery = discover(opened, named, given)
     topics, parameters = discovery.topics, discovery.parameters

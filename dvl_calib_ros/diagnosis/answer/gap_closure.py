@@ -1,4 +1,7 @@
-"""Gap and closure: size of the error and share that the effects explain, on held-out data."""
+"""Gap and closure: size of the error and share that the effects explain, on held-out data.
+
+Shapes: F samples, M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 

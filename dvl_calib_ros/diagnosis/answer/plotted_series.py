@@ -1,4 +1,7 @@
-"""Series of a diagnosis for its pictures."""
+"""Series of a diagnosis for its pictures.
+
+Shapes: F samples, M bins of time.
+"""
 
 from __future__ import annotations
 

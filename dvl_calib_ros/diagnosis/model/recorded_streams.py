@@ -157,7 +157,11 @@ class RecordedStreams:
         return np.asarray(attitude.kept.at("rotation", at, rotation))
 
     def angular_velocity(self, at: Array) -> Array:
-        """Return (M, 3) rad/s, body: of the gyroscopes, or of the attitude if these are too slow."""
+        """Return the angular velocity (M, 3) rad/s, body axes, at times (M,) s.
+
+        It is that of the gyroscopes, or the derivative of the attitude if the gyroscopes are too slow. Results are
+        cached by the times.
+        """
         rates, attitude = self.rates, self.attitude
         if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
             own = rates.denoised

@@ -1,4 +1,7 @@
-"""Times at which the streams of a recording are compared."""
+"""Times at which the streams of a recording are compared.
+
+Shapes: F samples, M bins of time.
+"""
 
 from __future__ import annotations
 

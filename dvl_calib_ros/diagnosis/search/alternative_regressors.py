@@ -1,4 +1,7 @@
-"""Dictionary of functions of motion or time that a systematic residual may follow."""
+"""Dictionary of functions of motion or time that a systematic residual may follow.
+
+Shapes: M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 Linearised about a fit, all effects share one Gram matrix. Combinations of up to three effects are small least squares
 problems in it.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ moving mountings are rare, so the heading is named first, unless the same headin
 
 An outlier of a fast stream is found from its neighbours. A vehicle can turn between the samples of a slow stream: an
 outlier there must also contradict the other stream, by as much and in the same direction.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 Score tests against a dictionary of regressors, each with a free vector in the body frame, propose. Prediction of
 held-out stretches decides, with the noise re-estimated beside the regressor: slow noise is the rival explanation.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations
