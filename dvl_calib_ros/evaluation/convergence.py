@@ -1,4 +1,7 @@
-"""Convergence of the misalignment: its error over calibration time, from ten seconds on."""
+"""Convergence of the misalignment: its error over calibration time, from ten seconds on.
+
+Shapes: B combinations of errors, N samples, T points of time.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 B variants of a run (combinations of errors) are aligned and gated like recordings, then processed as one array.
 test_evaluation.py verifies that the states equal those of replayed bags.
+
+Shapes: B variants of a run, N samples, E calibration times, n states.
 """
 
 from __future__ import annotations

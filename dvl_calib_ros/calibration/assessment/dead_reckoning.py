@@ -2,6 +2,8 @@
 
 Integrated velocity errors give the position error. Each sample is corrected by an estimate that has not seen its
 stretch, including lever arm and delay, so the drift predicts later data. It includes the reference's noise.
+
+Shapes: N samples, K of them in the track, P points kept for the map.
 """
 
 from __future__ import annotations

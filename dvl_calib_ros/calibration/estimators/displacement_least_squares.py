@@ -5,6 +5,8 @@ arm (3) m beyond the parameters', delay of the fixes s, and heading deviation (5
 together. Their noise is white, plus a Gauss-Markov process (multipath, sound speed of a beacon) and a random walk (dead
 reckoning). A grid of hypotheses has their sizes and memories, and the result is the mixture by evidence, so σ includes
 the unknown noise.
+
+Shapes: N fixes, B blocks of time, A axes, G hypotheses of the noise, F sizes of the heading deviation.
 """
 
 from __future__ import annotations

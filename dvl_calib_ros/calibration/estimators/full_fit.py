@@ -3,6 +3,8 @@
 The method is in docs/models.md, "full: all unknowns in one fit". Blocks are linearised about one point and added to a
 chain (slow_errors.py), so each further block costs one step. The point is renewed when a day's number of blocks reaches
 a power of two, or when the estimate has moved away from it. Both depend on the blocks only, so live and replay agree.
+
+Shapes: C points of the prior of the slow errors, A combinations of priors, n states of [vehicle, each day].
 """
 
 from __future__ import annotations

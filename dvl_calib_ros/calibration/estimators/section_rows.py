@@ -1,4 +1,7 @@
-"""Rows of `full` between two knots of its slow errors: their median, misfit, mean climb and bins."""
+"""Rows of `full` between two knots of its slow errors: their median, misfit, mean climb and bins.
+
+Shapes: J references of a section, k tested effects.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ A slow error is a first-order Gauss-Markov process, piecewise linear between kno
 condensed once to a Gram matrix over [slow errors at its start, at its end, states, residual]. This does not depend on
 the process's parameters. Given those, Schur complements eliminate the knots of a recording in order (a Kalman filter in
 information form). A section is held out by a zero Gram matrix; recordings add up after elimination.
+
+Shapes: C points of the prior of the slow errors, J references or bins.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 Blocks of `verification_block` are assigned to `FOLDS` folds in turn, so all folds cover the whole run. With Φ = I the
 information of samples is additive (kalman.py). One information matrix per fold and model is stored, and solving without
 a fold leaves it out: one pass, constant memory.
+
+Shapes: K models, N samples, n states.
 """
 
 from __future__ import annotations

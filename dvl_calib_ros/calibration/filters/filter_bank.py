@@ -2,6 +2,8 @@
 
 Switching models changes only which state is read, so a selected model has run from the start. The models of one `Group`
 are stacked and updated together, in blocks of any length.
+
+Shapes: K models, N samples, E requested states, n states.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Setup of the Kalman filter by models: initial state, rows, gates, and the meaning of its states."""
+"""Setup of the Kalman filter by models: initial state, rows, gates, and the meaning of its states.
+
+Shapes: K models, N samples, n states.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""History of the model states, thinned to constant memory."""
+"""History of the model states, thinned to constant memory.
+
+Shapes: K models, E rows of samples, n states.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ The covariance of a filter assumes white noise R. Larger or correlated noise and
 more. With Λ_b, y_b the information of block b (Λ = Λ₀ + Σ Λ_b), its score s_b = y_b - Λ_b x at the common estimate x
 has covariance Λ_b under the model. The actual scatter Σ s_b s_bᵀ gives the "sandwich" covariance P (Λ₀ + Σ s_b s_bᵀ) P
 (White, "Maximum likelihood estimation of misspecified models", 1982).
+
+Shapes: K models, B blocks of time, S estimates, n states.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@ With s the stamp of a reference sample, ρ and τ the delays of reference and DV
     B(s - ρ) + ω(s - ρ) × l - (1 + k) C v(s + δ),   B(s - ρ) = R(s - ρ)ᵀ g(s).
 
 It is linearised about the last round: δ by the slope of v, ρ by ω × B, because another attitude rotates the reference.
+
+Shapes: J compared references, A measured axes, 9 states.
 """
 
 from __future__ import annotations

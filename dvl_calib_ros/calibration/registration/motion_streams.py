@@ -1,4 +1,7 @@
-"""Motion: DVL, reference and IMU streams as smoothed columns, in s since a common epoch."""
+"""Motion: DVL, reference and IMU streams as smoothed columns, in s since a common epoch.
+
+Shapes: J points of time, N samples.
+"""
 
 from __future__ import annotations
 

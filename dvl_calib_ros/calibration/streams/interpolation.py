@@ -3,6 +3,8 @@
 Delayed streams are compared at times between their samples. Linear interpolation would bias the delay: its noise is
 halved midway between samples, and it ignores curvature. Local regression (Cleveland, "Robust locally weighted
 regression", 1979), a weighted quadratic through five or six samples, filters alike everywhere and has a slope.
+
+Shapes: N samples, interpolated at J points of time.
 """
 
 from __future__ import annotations
