@@ -115,16 +115,10 @@ def checked_replay(
         recordings = _calibrated_individually(recording, parameters, topics, progress_of)
     replayed = _replay_from_valid_start(recording, parameters, topics, progress_of, parts, with_history)
     if mounting_is_guessed and (rpy := _mounting_instead_of_guess(replayed.result)) is not None:
-        better = parameters.replace(mounting_rpy=rpy)
         return checked_replay(
-            recording,
-            better,
-            topics,
-            on_progress,
-            merge=merge,
-            with_history=with_history,
-            contradictions=contradictions,
-        )
+            recording, parameters.replace(mounting_rpy=rpy), topics, on_progress, merge=merge,
+            with_history=with_history, contradictions=contradictions,
+        )  # fmt: skip
     if contradictions:
         result = replayed.result
         judged = {name: _with_frame_doubts(each, contradictions) for name, each in result.verifications.items()}
@@ -149,8 +143,8 @@ def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reas
         elif contradiction.code in DECISIVE or (is_rejected and is_cause(contradiction)):
             kept.append(contradiction.weighed(Severity.REJECT))
     if any(reason.code == "MOUNTING_CONTRADICTED" for reason in kept):  # which says it with the option to type
-        reasons = (each for each in verification.reasons if "MOUNTING_FITS" not in {one.code for one in each.causes})
-        verification = replace(verification, reasons=tuple(reasons))
+        without = [reason for reason in verification.reasons if "MOUNTING_FITS" not in [c.code for c in reason.causes]]
+        verification = replace(verification, reasons=tuple(without))
     return verification.with_objections(kept) if kept else verification
 
 

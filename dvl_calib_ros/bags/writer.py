@@ -176,19 +176,19 @@ class BagWriter:
         if not others:
             return
         metadata = [load_yaml(path / "metadata.yaml", "metadata file") for path in (first, *others)]
-        whole, *rest = (each["rosbag2_bagfile_information"] for each in metadata)
-        for path, part in zip(others, rest, strict=True):
-            for name in part["relative_file_paths"]:
+        joined, *added = (document["rosbag2_bagfile_information"] for document in metadata)
+        for path, information in zip(others, added, strict=True):
+            for name in information["relative_file_paths"]:
                 os.replace(path / name, first / name)
             shutil.rmtree(path)
             for key in ("relative_file_paths", "files", "topics_with_message_count"):
-                whole[key] += part[key]
-            whole["message_count"] += part["message_count"]
-        files = [each for each in whole["files"] if each["message_count"]]
+                joined[key] += information[key]
+            joined["message_count"] += information["message_count"]
+        files = [file for file in joined["files"] if file["message_count"]]
         starts = [file["starting_time"]["nanoseconds_since_epoch"] for file in files]
-        ends = [start + each["duration"]["nanoseconds"] for start, each in zip(starts, files, strict=True)]
-        whole["starting_time"] = {"nanoseconds_since_epoch": min(starts)}
-        whole["duration"] = {"nanoseconds": max(ends) - min(starts)}
+        ends = [start + file["duration"]["nanoseconds"] for start, file in zip(starts, files, strict=True)]
+        joined["starting_time"] = {"nanoseconds_since_epoch": min(starts)}
+        joined["duration"] = {"nanoseconds": max(ends) - min(starts)}
         (first / "metadata.yaml").write_text(yaml.safe_dump(metadata[0], sort_keys=False), encoding="utf-8")
 
     def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:

@@ -131,13 +131,12 @@ class Assessor:
         deviation: heading deviation, as `Estimate.heading_deviation`.
         """
         with self._further.settled():
-            own = self._estimates.estimators[name].navigation()
-        if own is not None:
-            return own
-        kept = self._further.recording
-        if kept is None:
+            of_estimator = self._estimates.estimators[name].navigation()
+        if of_estimator is not None:
+            return of_estimator
+        if self._further.recording is None:
             return None
-        recording, epoch_ns = kept
+        recording, epoch_ns = self._further.recording
         try:
             terms = self.held_out_terms(name)
         except np.linalg.LinAlgError:
@@ -145,11 +144,11 @@ class Assessor:
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         # one correction per fold and day, by its index in the flat list
         n_days, p = len(terms[0]), self._estimates.parameters
-        parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
-        corrections = [day for of_days in terms for day in of_days]
+        indices = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
+        corrections = [day_terms for fold_terms in terms for day_terms in fold_terms]
         further = self._further
         return dead_reckoned(
-            recording, parts, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
+            recording, indices, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
         )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:

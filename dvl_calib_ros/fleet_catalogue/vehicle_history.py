@@ -189,14 +189,14 @@ def _compare_if_several(several: Sequence[Extrinsics]) -> Comparison | None:
 def _average_days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
     """Average the recordings of each day, separately before and after a movement of the mounting."""
     by_day: dict[int, list[tuple[Extrinsics, Array]]] = defaultdict(list)
-    for each in entries:
-        if each.extrinsics is not None and each.covariance_of_recording is not None:
-            by_day[each.extrinsics.first_ns // DAY_NS].append((each.extrinsics, each.covariance_of_recording))
-    found = []
-    for _, of_one_day in sorted(by_day.items()):
-        of_one_day.sort(key=lambda each: each[0].first_ns)
-        found += [_average_day(part) for part in _split_at_moves(of_one_day)]
-    return found
+    for entry in entries:
+        if entry.extrinsics is not None and entry.covariance_of_recording is not None:
+            by_day[entry.extrinsics.first_ns // DAY_NS].append((entry.extrinsics, entry.covariance_of_recording))
+    averages = []
+    for _, recordings in sorted(by_day.items()):
+        recordings.sort(key=lambda recording: recording[0].first_ns)
+        averages += [_average_day(part) for part in _split_at_moves(recordings)]
+    return averages
 
 
 def _split_at_moves(recordings: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:

@@ -155,8 +155,8 @@ def _ensembles(content: bytes) -> Iterator[list[tuple[int, bytes]]]:
     """Yield ID and data of all parts of each whole ensemble."""
     start = 0
     while (found := _next_ensemble(content, start)) is not None:
-        at, start = found
-        body = content[at : start - 2]
+        begin, start = found
+        body = content[begin : start - 2]
         n_types = body[5]
         if 6 + 2 * n_types > len(body):
             continue
@@ -209,12 +209,12 @@ def _pd0_attitudes(
     path: Path, attitudes: dict[int, tuple[float, float, float]], nmea: Nmea
 ) -> tuple[list[int], Array, tuple[str, ...]]:
     """Return stamps, roll, pitch, heading (N, 3) rad, and notes on their source."""
-    own = sorted(attitudes)
-    rpy = np.array([attitudes[at] for at in own]).reshape(-1, 3)
+    dvl_stamps = sorted(attitudes)
+    rpy = np.array([attitudes[stamp] for stamp in dvl_stamps]).reshape(-1, 3)
     stamps, headings = nmea.headings()
-    if stamps and own:
-        at = np.array(stamps, dtype=np.int64) - own[0]
-        tilts = [np.interp(at, np.array(own, dtype=np.int64) - own[0], rpy[:, place]) for place in (0, 1)]
+    if stamps and dvl_stamps:
+        since_first, dvl_since_first = (np.array(ns, dtype=np.int64) - dvl_stamps[0] for ns in (stamps, dvl_stamps))
+        tilts = [np.interp(since_first, dvl_since_first, rpy[:, axis]) for axis in (0, 1)]
         note = f"{path}: the heading is from its HDT sentences, pitch and roll are the DVL's own"
         return stamps, np.column_stack([*tilts, headings]), (note,)
     if not len(rpy) or not np.ptp(rpy, axis=0).any():  # no sensor: a constant setting
@@ -223,7 +223,7 @@ def _pd0_attitudes(
         f"{path}: heading, pitch and roll are from the DVL's own sensors; the heading is magnetic unless the "
         "setting EB is the declination; give --attitude for another source"
     )
-    return own, rpy, (note,)
+    return dvl_stamps, rpy, (note,)
 
 
 def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float] | None:

@@ -264,14 +264,14 @@ class MessageDecoder:
         """Return the velocity between a position and the one a window earlier; the position itself goes to `on_fix`."""
         if not kind.is_valid(message):
             return Refusal(NO_FIX)
-        place, given = kind.place(message), kind.covariance(message)
+        place, covariance = kind.place(message), kind.covariance(message)
         if frame is not VelocityFrame.BODY and math.isfinite(sum(place)):
             self._origin = self._origin or place
-            self.on_fix(stamp_ns, *_east_north_up(kind, self._origin, place, given, frame))
-        found = self._fixes(stamp_ns, *place, given)
-        if found is None:
+            self.on_fix(stamp_ns, *_east_north_up(kind, self._origin, place, covariance, frame))
+        mean = self._fixes(stamp_ns, *place, covariance)
+        if mean is None:
             return Refusal(FIRST_FIX)
-        return ReferenceSample(found.stamp_ns, found.velocity, found.covariance, frame)
+        return ReferenceSample(mean.stamp_ns, mean.velocity, mean.covariance, frame)
 
     def imu(self, message: Any, received_ns: int) -> ImuSample | Refusal:
         """Decode a sensor_msgs/Imu. A covariance that starts with -1 means that the quantity is missing.

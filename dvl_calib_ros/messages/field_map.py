@@ -260,16 +260,16 @@ def suggested(store: Typestore, msgtype: str) -> str:
 
 def _velocities(fields: _Fields, below: Mapping[str, Description]) -> Iterator[str]:
     """Yield maps of possible velocities, the most likely first."""
-    named = {path: each for path, each in below.items() if re.search(r"vel|linear|(^|_|\.)v[xyz]$", path, re.I)}
-    yield from (f"velocity={path}" for path, each in named.items() if _is_three(fields, each))
-    for path, each in named.items():
+    named = {path: kind for path, kind in below.items() if re.search(r"vel|linear|(^|_|\.)v[xyz]$", path, re.I)}
+    yield from (f"velocity={path}" for path, kind in named.items() if _is_three(fields, kind))
+    for path, kind in named.items():
         y, z = (re.sub(r"(?<![a-uw-z])x(?![a-z])", axis, path) for axis in "yz")
-        if y != path and fields.is_number(each) and each[1][0] != "bool" and y in below and z in below:
+        if y != path and fields.is_number(kind) and kind[1][0] != "bool" and y in below and z in below:
             yield f"velocity={path},{y},{z}"
-    for path, each in below.items():
-        own = dict(fields.walk(element)) if (element := fields.element(each)) is not None else {}
-        vectors = [name for name, of in own.items() if fields.is_vector(of)]
-        speeds = [name for name, of in own.items() if "vel" in name and fields.is_number(of)]
+    for path, kind in below.items():
+        inner = dict(fields.walk(element)) if (element := fields.element(kind)) is not None else {}
+        vectors = [name for name, inner_kind in inner.items() if fields.is_vector(inner_kind)]
+        speeds = [name for name, inner_kind in inner.items() if "vel" in name and fields.is_number(inner_kind)]
         if vectors and speeds:
             yield f"beams={path},{vectors[0]},{speeds[0]}"
 

@@ -279,8 +279,8 @@ def _renumbered(recordings: Sequence[Recording], names: Collection[str]) -> dict
     """Renumber the arrivals in all recordings by log time, and by recording at equal times."""
     arrivals, logs = [], []
     for recording in recordings:
-        found = [part.arrivals for parts in recording.columns.values() for part in parts] or [_NOTHING]
-        arrival, log_ns = (np.concatenate(column) for column in zip(*found, strict=True))
+        by_topic = [part.arrivals for parts in recording.columns.values() for part in parts] or [_NOTHING]
+        arrival, log_ns = (np.concatenate(column) for column in zip(*by_topic, strict=True))
         order = np.argsort(arrival, kind="stable")
         arrivals.append(arrival[order])
         logs.append(log_ns[order])
@@ -289,10 +289,10 @@ def _renumbered(recordings: Sequence[Recording], names: Collection[str]) -> dict
     columns: dict[str, list[TopicColumns]] = {
         name: [] for name in names if any(name in recording.columns for recording in recordings)
     }
-    at = 0
+    begin = 0
     for recording, arrival in zip(recordings, arrivals, strict=True):
-        new_arrivals = new_arrival[at : at + len(arrival)]
-        at += len(arrival)
+        new_arrivals = new_arrival[begin : begin + len(arrival)]
+        begin += len(arrival)
 
         def renumbered(old_arrivals: Stamps, arrival: Stamps = arrival, new_arrivals: Stamps = new_arrivals) -> Stamps:
             return np.asarray(new_arrivals[np.searchsorted(arrival, old_arrivals)])
@@ -309,13 +309,13 @@ def _read(
     path: Path, bag: BagReader, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
 ) -> Recording:
     """Read a bag window by window: columns of moving topics, static transforms, descriptions, water readings."""
-    found = _Contents(bag, topics, parameters)
+    contents = _Contents(bag, topics, parameters)
     start_ns, end_ns = bag.span_ns
-    for window in windows(bag, found.topics, found.one_by_one):
+    for window in windows(bag, contents.topics, contents.one_by_one):
         for part in window.parts:
-            found.take(part)
+            contents.take(part)
         on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
-    columns = {topic: collector.columns() for topic, collector in found.sensors.items()}
+    columns = {topic: collector.columns() for topic, collector in contents.sensors.items()}
     for topic in _restamped(columns, parameters.restamp, path):
         columns[topic] = columns[topic].restamped()
     kept, file_spans_ns, far_findings = without_far(columns, bag.file_spans_ns)
@@ -329,8 +329,8 @@ def _read(
         (path,), types, held, counts, file_spans_ns,
         notes=(*bag.notes, *map(str, far_findings)),
         columns={topic: (column,) for topic, column in kept.items()},
-        transforms=tuple(found.transforms), descriptions=tuple(dict.fromkeys(found.descriptions)),
-        waters=tuple(reading for water in found.waters.values() for reading in water.readings()),
+        transforms=tuple(contents.transforms), descriptions=tuple(dict.fromkeys(contents.descriptions)),
+        waters=tuple(reading for water in contents.waters.values() for reading in water.readings()),
         field_maps=_field_maps(bag),
     )  # fmt: skip
 

@@ -116,18 +116,21 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel]) -> Sh
     problem = selection.fitter.problem
     recorded = [recording.dvl.values for recording in problem.recordings]
     time = np.concatenate([recording.dvl.time for recording in problem.recordings])
-    recording_of = np.repeat(np.arange(len(recorded), dtype=np.intp), [len(each) for each in recorded])
+    recording_of = np.repeat(np.arange(len(recorded), dtype=np.intp), [len(velocity) for velocity in recorded])
     windows: Array = np.floor(time / WINDOW_S) + 1e6 * recording_of
     full = _held_out(selection, ladder[-1])
     # a time shift or lag changes the reference's noise, which must not be counted twice
-    shifts = tuple(each for each in ladder[-1].added if _is_time_shift(each))
+    shifts = tuple(effect for effect in ladder[-1].added if _is_time_shift(effect))
     ideal = _held_out(selection, SimulatedModel("", shifts, {}))
     # the vehicle's residual includes its reference's noise; the simulator's reference is noise-free
     of_reference = _reference_noise(problem, selection.fit.hypothesis, rng)
-    drawn = [_random_noise(simulator.residuals, dvl, rng) + r[0] for dvl, r in zip(recorded, of_reference, strict=True)]
+    drawn = [
+        _random_noise(simulator.residuals, dvl, rng) + noise[0]
+        for dvl, noise in zip(recorded, of_reference, strict=True)
+    ]
     own_noise = [
-        turned_over(dvl - predicted, noise_spectrum(of_it, one.dvl.noise), rng)
-        for dvl, predicted, of_it, one in zip(recorded, full, of_reference, problem.recordings, strict=True)
+        turned_over(recording.dvl.values - predicted, noise_spectrum(noise, recording.dvl.noise), rng)
+        for recording, predicted, noise in zip(problem.recordings, full, of_reference, strict=True)
     ]
     all_recorded, all_ideal = np.concatenate(recorded), np.concatenate(ideal)
     recorded_errors = all_recorded - all_ideal

@@ -485,12 +485,12 @@ def open_chunk(file: BinaryIO, at: int, length: int, size: int, index: ChunkInde
         length = head.size + head.packed_size
     else:
         head = chunk_head(file, at)
-    lengths = [each for each in (head.packed_size, length - head.size) if 0 <= each <= LARGEST_RECORD]
+    lengths = [packed for packed in (head.packed_size, length - head.size) if 0 <= packed <= LARGEST_RECORD]
     if not lengths or head.unpacked_size > LARGEST_RECORD:
         raise DamagedError(f"the chunk at byte {at} claims more than {LARGEST_RECORD} bytes")
     start = at + RECORD_HEAD.size + head.size
     if lengths[1:] and lengths[1] != lengths[0]:
-        lengths.sort(key=lambda each: not _record_follows(file, start + each, size, Tables(None)))
+        lengths.sort(key=lambda packed: not _record_follows(file, start + packed, size, Tables(None)))
     chunk = _unpack_chunk(file, at, start, head, lengths[0], size)
     if chunk.damage and lengths[1:] and lengths[1] != lengths[0]:
         other = _unpack_chunk(file, at, start, head, lengths[1], size)

@@ -263,9 +263,10 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     values = np.array([_near(calibration.value, base.value) for calibration in several])
     value, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: value of the first
     covariance = np.zeros((N_COMPONENTS, N_COMPONENTS))
-    own, by_biases = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
-    information, vector = own.sum(axis=0), np.einsum("nij,nj->i", own, values)
-    bias_information = own @ by_biases
+    informations = np.array([calibration.information for calibration in several])
+    by_biases = np.array([calibration.by_bias for calibration in several])
+    information, vector = informations.sum(axis=0), np.einsum("nij,nj->i", informations, values)
+    bias_information = informations @ by_biases
     for index in (group[observable[group]] for group in GROUPS):
         # bias of σ 1 as an additional state
         cross_information = bias_information[:, index].sum(axis=0)

@@ -149,12 +149,14 @@ def recursion(
         for k in range(len(x))
     ]
     paths, used, nis = zip(*models, strict=True)
-    at = None
+    at_ends = None
     if ends is not None:
-        wanted = [[path[end] for path in paths] for end in ends.tolist()]
-        at = GaussianState(*(np.array([[state[part] for state in each] for each in wanted]) for part in range(2)))
-    x, p = (np.array([path[-1][part] for path in paths]) for part in range(2))
-    return Updated(x, p, np.array(used), np.array(nis), at)
+        states = [[path[end] for path in paths] for end in ends.tolist()]
+        at_ends = GaussianState(
+            *(np.array([[state[k] for state in of_models] for of_models in states]) for k in range(2))
+        )
+    x, p = (np.array([path[-1][k] for path in paths]) for k in range(2))
+    return Updated(x, p, np.array(used), np.array(nis), at_ends)
 
 
 def _recursion_of_one(

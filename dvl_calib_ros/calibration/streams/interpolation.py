@@ -235,7 +235,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     weight_u2 = weight_u * u
     # normal equations of a + b u + c u², and the first two rows of their inverse by cofactors
     weight_u3 = weight_u2 * u
-    s0, s1, s2, s3, s4 = (np.add.reduce(each) for each in (weight, weight_u, weight_u2, weight_u3, weight_u3 * u))
+    s0, s1, s2, s3, s4 = (np.add.reduce(moment) for moment in (weight, weight_u, weight_u2, weight_u3, weight_u3 * u))
     c00, c01, c02 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
     c11, c12 = s0 * s4 - s2 * s2, s1 * s2 - s0 * s3
     determinant = s0 * c00 + s1 * c01 + s2 * c02

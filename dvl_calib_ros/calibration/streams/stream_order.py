@@ -304,14 +304,14 @@ class Track(RowTable):
         if not len(stamps):
             nowhere = np.zeros(len(stamps_ns), dtype=np.intp)
             return Brackets(nowhere, nowhere, nowhere.astype(float), np.zeros(len(stamps_ns), dtype=bool))
-        at = np.minimum(np.searchsorted(stamps, stamps_ns), len(stamps) - 1)
-        after_ns = stamps[at]
-        gap_ns = np.where(at > 0, after_ns - stamps[np.maximum(at - 1, 0)], self.max_gap_ns + 1)
+        following = np.minimum(np.searchsorted(stamps, stamps_ns), len(stamps) - 1)
+        after_ns = stamps[following]
+        gap_ns = np.where(following > 0, after_ns - stamps[np.maximum(following - 1, 0)], self.max_gap_ns + 1)
         near = gap_ns <= self.max_gap_ns
         exact = after_ns == stamps_ns
         found = (stamps_ns <= newest_ns) & (stamps_ns >= newest_ns - self.retention_ns) & (exact | near)
         fraction = np.where(exact, 1.0, (stamps_ns - (after_ns - gap_ns)) / gap_ns)
-        after = at + self.begin
+        after = following + self.begin
         return Brackets(np.where(near, after - 1, -1), after, fraction, found)
 
 
