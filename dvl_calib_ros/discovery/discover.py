@@ -73,7 +73,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
     if found.topics.gnss not in recording.types and not found.contradictions:
-        surveys = [one.whole(found.topics) for one in recording.each]
+        surveys = [part.whole(found.topics) for part in recording.each]
         signs = sign_findings(surveys, found.topics, found.parameters, "dvl_axes" in named.parameters)
         return replace(found, contradictions=tuple(signs))
     clocks = clocks_of_recording(recording, found, named)
@@ -495,8 +495,8 @@ class _Search:
             ahead_in_body = known @ mean
             is_sideways = abs(ahead_in_body[1]) > abs(ahead_in_body[0])
             if (is_sideways or ahead_in_body[0] < 0.0) and not self._is_given("mounting_rpy"):
-                given, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
-                fields = {"given": in_degrees(given), "found": in_degrees(fits), "option": as_option(fits)}
+                configured, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
+                fields = {"given": in_degrees(configured), "found": in_degrees(fits), "option": as_option(fits)}
                 code = "TRAVELS_SIDEWAYS" if is_sideways else "TRAVELS_ASTERN"
                 self._contradictions.append(finding(code, also=_other_axes(known, mean), **fields))
         elif abs(yaw) > OTHER_MOUNTING:

@@ -159,19 +159,21 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         recording = open_recording(recording, parameters=parameters)
     discovery = discover(recording, parameters, given)
     streams = _streams(recording, discovery)
-    looks = {role: recording.survey.previews.get(each.topic) for role, each in streams.items()}
+    previews = {role: recording.survey.previews.get(topic.topic) for role, topic in streams.items()}
     start_ns, end_ns = recording.span_ns
     recorded_s = 1e-9 * (end_ns - start_ns)
-    seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
-    velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
+    seconds = {
+        role: recorded_s * (1.0 if preview is None else preview.clock_rate) for role, preview in previews.items()
+    }
+    velocity = _body_velocity(streams["dvl"], previews["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
     replayed, cannot = _replayed(recording, discovery)
     verification = None if replayed is None else replayed.result.verifications[replayed.result.selected]
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
     reasons = () if verification is None else tuple(verification.reasons)
-    said = set(map(str, reasons))
-    findings = [reason for reason in findings if str(reason.numbers.get("says")) not in said]  # said once
+    in_verdict = set(map(str, reasons))
+    findings = [reason for reason in findings if str(reason.numbers.get("says")) not in in_verdict]
     judged = Severity.REJECT if verification is None else verification.verdict
     if judged is not Severity.REJECT:  # the replay is usable, so no finding prevents a calibration
         findings = [reason.weighed(Severity.WARNING) if _has_error([reason]) else reason for reason in findings]
@@ -179,7 +181,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         recording.paths,
         seconds["dvl"],
         tuple(
-            _content(role, topic, looks[role], recording.counts[topic.topic] / (seconds[role] or math.inf))
+            _content(role, topic, previews[role], recording.counts[topic.topic] / (seconds[role] or math.inf))
             for role, topic in streams.items()
         ),
         discovery,

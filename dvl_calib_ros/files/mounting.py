@@ -230,8 +230,8 @@ def calibrated_urdf(
     initial = calibrated.parameters.rotation_dvl_from_body.T
     if calibrated.turned and current[:, 2] @ initial[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
         corrected, initial = corrected @ FLU_FROM_FRD, initial @ FLU_FROM_FRD
-    known = None if keep_position or calibrated.position is None else np.array(calibrated.position)
-    position = mounting.position if known is None else known
+    is_kept = keep_position or calibrated.position is None
+    position = mounting.position if is_kept else np.array(calibrated.position)
     tolerance = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # a configured position may be rounded
     is_placed = np.abs(mounting.position - position).max() < tolerance
     if angle_between(current, corrected) < ALREADY and is_placed:
@@ -270,10 +270,10 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
             f"{path}: sets initial_calibration, whose angles are relative to the previous mounting; remove it first"
         )
     for name, value in values.items():
-        now, begun_with = getattr(in_file, name), getattr(calibrated.parameters, name)
-        known = [np.array(each) for each in (getattr(default, name), begun_with, value)]
+        now, initial = getattr(in_file, name), getattr(calibrated.parameters, name)
+        expected = [np.array(values) for values in (getattr(default, name), initial, value)]
         within = SAME_POSITION if name == "lever_arm" else SAME_MOUNTING
-        if not any(np.allclose(now, each, rtol=0.0, atol=within) for each in known) and not force:
+        if not any(np.allclose(now, allowed, rtol=0.0, atol=within) for allowed in expected) and not force:
             raise InputError(
                 f"{path}: sets {name} to {as_yaml(in_file.as_dict()[name])}, but {calibrated.path} began with "
                 f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's value, or write "

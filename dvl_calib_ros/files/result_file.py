@@ -170,9 +170,8 @@ def _found_quantities(result: Result) -> dict[str, str]:
 
 def _in_words(quantity: Quantity) -> str:
     unit = quantity.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
-    return f"{quantity.value:.2f} +- {quantity.std:.2f} {unit}" + (
-        "" if quantity.shown else " (not observable in this data)"
-    )
+    remark = "" if quantity.shown else " (not observable in this data)"
+    return f"{quantity.value:.2f} +- {quantity.std:.2f} {unit}{remark}"
 
 
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
@@ -275,20 +274,20 @@ def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
     """
     try:
         before: Any = load_yaml(path, "result file")
-        ranks = [_QUALITIES.index(_quality(each)) for each in (before, document)]
-        old, new = (each["mounting"] for each in (before, document))
-        p_old, p_new = (_covariance_of_angles(each) for each in (old, new))
-        rotations = [rotation_from_rpy(each["corrected_rpy"]) for each in (old, new)]
+        old_rank, new_rank = _QUALITIES.index(_quality(before)), _QUALITIES.index(_quality(document))
+        old, new = before["mounting"], document["mounting"]
+        p_old, p_new = _covariance_of_angles(old), _covariance_of_angles(new)
+        old_rotation, new_rotation = rotation_from_rpy(old["corrected_rpy"]), rotation_from_rpy(new["corrected_rpy"])
         same = all(old[name] == new[name] for name in ("nominal_rpy", "frame_id", "child_frame_id"))
         continued = _ResultValue.of(before).continued_by(_ResultValue.of(document))
         both = np.flatnonzero((np.diag(p_old) > 0.0) & (np.diag(p_new) > 0.0))
-        turn, p = turn_between(*rotations)[both], (p_old + p_new)[np.ix_(both, both)]
+        turn, p = turn_between(old_rotation, new_rotation)[both], (p_old + p_new)[np.ix_(both, both)]
         moved = bool(len(both)) and chi2_sf(float(turn @ np.linalg.solve(p, turn)), len(both)) < MOVED
     except (InputError, OSError, LookupError, TypeError, ValueError, OverflowError):
         return None  # no result file, or a damaged one
-    if not same or ranks[0] < ranks[1] or not before["used"]:
+    if not same or old_rank < new_rank or not before["used"]:
         return None
-    if ranks[0] > ranks[1]:
+    if old_rank > new_rank:
         return before
     return before if not continued and not moved and _angle_spread(p_new) > _angle_spread(p_old) else None
 
@@ -358,10 +357,10 @@ def _backups_to_keep(new: _ResultValue, n_backups: int, before: Sequence[Path]) 
             continue
         kept.append(path)
         new = current or new
-    first, rest = kept[:1], kept[1:]
-    rest.sort(key=lambda path: -1 if (current := worth[path]) is None else current.convergence, reverse=True)  # stable
-    best = rest[: n_backups - len(first)]
-    return [*first, *(path for path in before if path in best)]
+    newest, older = kept[:1], kept[1:]
+    older.sort(key=lambda path: -1 if (current := worth[path]) is None else current.convergence, reverse=True)  # stable
+    best = older[: n_backups - len(newest)]
+    return [*newest, *(path for path in before if path in best)]
 
 
 def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = None) -> dict[str, GaussianState]:

@@ -271,25 +271,24 @@ def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
     Only if it is significant on one side: the reference's noise, and its motion between samples, also contribute to
     these means and differ between the sides.
     """
-    findings = [_finding(log, "coloured_reference_noise") for log in (vehicle, simulator)]
-    findings = [colour if colour is not None and colour.p < GROWS else None for colour in findings]
-    if findings[0] is None and findings[1] is None:
+    of_vehicle, of_simulator = _colour_finding(vehicle), _colour_finding(simulator)
+    if of_vehicle is None and of_simulator is None:
         return None
-    slow = [_block_means(log) for log in (vehicle, simulator)]
-    if min(len(means) for means in slow) < 3 * FEWEST_BLOCKS:
+    vehicle_means, simulator_means = _block_means(vehicle), _block_means(simulator)
+    if min(len(vehicle_means), len(simulator_means)) < 3 * FEWEST_BLOCKS:
         return None
-    ratio = float(np.mean(slow[0] ** 2) / np.mean(slow[1] ** 2))
-    above = float(f_distribution.sf(ratio, len(slow[0]), len(slow[1])))
+    ratio = float(np.mean(vehicle_means**2) / np.mean(simulator_means**2))
+    above = float(f_distribution.sf(ratio, len(vehicle_means), len(simulator_means)))
     p = 2.0 * min(above, 1.0 - above)
-    values = [f.parameters["time_constant_s"] if f is not None else (0.0, 0.0, 0.0) for f in findings]
-    return Candidate(
-        "colour", "s", values[0], values[1], p,
-        (findings[0] is not None, findings[1] is not None), note="of DVL or reference",
-    )  # fmt: skip
+    times = [f.parameters["time_constant_s"] if f is not None else (0.0, 0.0, 0.0) for f in (of_vehicle, of_simulator)]
+    is_present = of_vehicle is not None, of_simulator is not None
+    return Candidate("colour", "s", times[0], times[1], p, is_present, note="of DVL or reference")
 
 
-def _finding(log: Log, name: str) -> NoiseFinding | None:
-    return next((entry for entry in log.diagnosis.noise if entry.name == name), None)
+def _colour_finding(log: Log) -> NoiseFinding | None:
+    """Return the diagnosis's finding of slow noise, if it is significant."""
+    found = (entry for entry in log.diagnosis.noise if entry.name == "coloured_reference_noise" and entry.p < GROWS)
+    return next(found, None)
 
 
 def _block_means(log: Log) -> Array:
@@ -346,21 +345,22 @@ def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
     names = common_names(vehicle, simulator)
     compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names))
     p = holm([*compared.p.values(), *(candidate.p for candidate in candidates)])
-    found = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
-    found += [compared.untested(name) for name in compared.names if name not in compared.p]
-    found.sort(key=lambda each: (ORDER.index(each.status), -each.adds_mps))
-    noise = [_noise(each, float(adjusted)) for each, adjusted in zip(candidates, p[len(compared.p) :], strict=True)]
-    noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
-    status = {candidate.name: candidate.status for candidate in found}
+    effects = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
+    effects += [compared.untested(name) for name in compared.names if name not in compared.p]
+    effects.sort(key=lambda effect: (ORDER.index(effect.status), -effect.adds_mps))
+    of_noise = p[len(compared.p) :].tolist()
+    noise = [_noise(candidate, adjusted) for candidate, adjusted in zip(candidates, of_noise, strict=True)]
+    noise.sort(key=lambda entry: (ORDER.index(entry.status), entry.p))
+    status = {effect.name: effect.status for effect in effects}
     compared_sizes = {name: (*compared.sizes[name], status[name]) for name in compared.p}
     own_effects = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
     shrunk = shrink(vehicle, simulator, models(compared_sizes, own_effects))
     levels = [levels_by_regime(log) for log in (vehicle, simulator)]
-    verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
+    verdict = _verdict(effects, noise, vehicle.diagnosis, simulator.diagnosis)
     return UnpairedComparison(
         verdict=verdict,
-        reasons=_reasons(verdict, found, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
-        effects=tuple(found),
+        reasons=_reasons(verdict, effects, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
+        effects=tuple(effects),
         noise=tuple(noise),
         levels={name: (level, levels[1][name]) for name, level in levels[0].items() if name in levels[1]},
         rungs=shrunk.rungs,

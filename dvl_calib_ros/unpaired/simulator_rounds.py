@@ -134,33 +134,33 @@ def close_gap(
         If the sides cannot be compared, or the simulator's log has no attitude and so no motion.
     """
     topics = simulator.topics.found_in(simulator.opened.types)
-    for path, one in zip(simulator.opened.paths, simulator.opened.each, strict=True):
-        if topics.imu not in one.types:
+    for path, recording in zip(simulator.opened.paths, simulator.opened.each, strict=True):
+        if topics.imu not in recording.types:
             raise InputError(
                 f"{path}: no attitude on {topics.imu}, so rounds have no motion to simulate on; record sensor_msgs/Imu "
                 "in the simulator, or compare without rounds"
             )
     steps = 2 + rounds
 
-    def part(number: int) -> Callable[[float], None]:
+    def share_of_step(number: int) -> Callable[[float], None]:
         return lambda share: on_progress((number + share) / steps)
 
-    real = read_log(vehicle, part(0))
-    as_recorded = compare_logs(real, read_log(simulator, part(1)))
-    found = [Round(replace(as_recorded, reasons=(*as_recorded.reasons, *other_frame(vehicle, simulator))))]
+    real = read_log(vehicle, share_of_step(0))
+    as_recorded = compare_logs(real, read_log(simulator, share_of_step(1)))
+    compared = [Round(replace(as_recorded, reasons=(*as_recorded.reasons, *other_frame(vehicle, simulator))))]
     document = None if real.diagnosis.dvl is None else diagnosis_document(real.diagnosis)
-    while document is not None and found[-1].claims and len(found) <= rounds:
-        if len(found) > 1:
-            corrected = corrected_document(document, found[-1].comparison)
+    while document is not None and compared[-1].claims and len(compared) <= rounds:
+        if len(compared) > 1:
+            corrected = corrected_document(document, compared[-1].comparison)
             if corrected == document:
                 break
             document = corrected
-        simulated = _simulated(document, len(found), simulator, folder, real.diagnosis)
-        log = read_log(simulated, part(1 + len(found)))
+        simulated = _simulated(document, len(compared), simulator, folder, real.diagnosis)
+        log = read_log(simulated, share_of_step(1 + len(compared)))
         log = replace(log, facts=tuple(replace(fact, latency=np.zeros(0)) for fact in log.facts))  # no real log times
-        found.append(Round(compare_logs(real, log), document))
+        compared.append(Round(compare_logs(real, log), document))
     on_progress(1.0)
-    return ClosedGap(tuple(found))
+    return ClosedGap(tuple(compared))
 
 
 def check_rounds(rounds: int | None, keep: Path | None) -> None:

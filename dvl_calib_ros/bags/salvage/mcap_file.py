@@ -206,13 +206,13 @@ def _whole_chunk(
     if chunk.damage:
         raise DamagedError(chunk.damage)
     starts = _indexed_starts(file, index, chunk.end)
-    places = None if starts is None else places_by_index(chunk.records, starts, tables)
-    places = places or places_of(chunk.records, tables)
-    if places is not None:
-        found = Batch(times(places.log_ns), *places[1:], chunk.records, channels)
+    located = None if starts is None else places_by_index(chunk.records, starts, tables)
+    located = located or places_of(chunk.records, tables)
+    if located is not None:
+        batch = Batch(times(located.log_ns), *located[1:], chunk.records, channels)
         if len(channels) < len(tables.channels):
-            found = found.part(np.isin(found.number, list(channels)))
-        return found.sorted()
+            batch = batch.part(np.isin(batch.number, list(channels)))
+        return batch.sorted()
     damage = Damage()
     messages = messages_of(at, chunk.records, tables, damage, channels)
     damage.raise_if_any()
@@ -329,17 +329,17 @@ class _FileWalk:
         has_ended: set at the end of the data. held: messages of the record at `at` itself, which count only if the
         record leads on to another.
         """
-        found, self.held, before = self.held, [], None
+        messages, self.held, before = self.held, [], None
         try:
             self.held, end, before = self._record(at)
         except DamagedError as error:
-            place, is_before_damaged = self._resume_after(at)
+            resumed_at, is_before_damaged = self._resume_after(at)
             if is_before_damaged and self._before is not None:
-                found, at = [], self._before
-            self._damage.note(str(error), place - at)
-            end = place
+                messages, at = [], self._before
+            self._damage.note(str(error), resumed_at - at)
+            end = resumed_at
         self._before = before
-        return found, end
+        return messages, end
 
     def _record(self, at: int) -> tuple[list[Found], int, int | None]:
         """Return the messages of the record at `at`, its end, and its start if the end is uncertain."""

@@ -155,12 +155,12 @@ def search(
         file.seek(window)
         data = np.frombuffer(file.read(_WINDOW + RECORD_HEAD.size - 1), dtype=np.uint8)
         first_bytes = data[: max(len(data) - RECORD_HEAD.size + 1, 0)]
-        places = np.flatnonzero((first_bytes >= opcodes[0]) & (first_bytes <= opcodes[1]))
+        candidates = np.flatnonzero((first_bytes >= opcodes[0]) & (first_bytes <= opcodes[1]))
         for high in range(5, RECORD_HEAD.size):  # the upper half of the length
-            places = places[data[places + high] == 0]
-        for place in places.tolist():
-            if accept(window + place):
-                return window + int(place)
+            candidates = candidates[data[candidates + high] == 0]
+        for candidate in candidates.tolist():
+            if accept(window + candidate):
+                return window + int(candidate)
     return None
 
 

@@ -178,7 +178,7 @@ def dead_reckoned(
     if slow is not None and recording.reference.in_body.all():
         slow = slow._replace(heading=0.0)  # body velocities need no heading
     ends = ends_of_stretches(distance)
-    kept = np.round(np.linspace(0, len(used) - 1, min(MAP_POINTS, len(used)))).astype(np.intp)
+    shown = np.round(np.linspace(0, len(used) - 1, min(MAP_POINTS, len(used)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
         distance_m=float(distance[-1]),
@@ -189,13 +189,13 @@ def dead_reckoned(
         after=drift_over(track_errors[1], distance, ends),
         noise_per_km=_noise(errors[1], step_s, distance, ends, slow),
         on_a_map=on_a_map,
-        stamps_ns=np.round(recording.dvl.times[used[kept]] * 1e9).astype(np.int64) + epoch_ns,
-        distances=distance[kept],
-        reference=reference[kept],
-        track_before=(reference - track_errors[0])[kept],
-        track_after=(reference - track_errors[1])[kept],
-        error_before=before.in_body[used[kept]],
-        error_after=after.in_body[used[kept]],
+        stamps_ns=np.round(recording.dvl.times[used[shown]] * 1e9).astype(np.int64) + epoch_ns,
+        distances=distance[shown],
+        reference=reference[shown],
+        track_before=(reference - track_errors[0])[shown],
+        track_after=(reference - track_errors[1])[shown],
+        error_before=before.in_body[used[shown]],
+        error_after=after.in_body[used[shown]],
         deviation=heading_deviation(after.yaw[used], heading) if on_a_map and heading is not None else None,
         followed=_followed(recording, after, used, parameters) if on_a_map else None,
         beam=beam,

@@ -111,17 +111,17 @@ class AttitudeRates:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")
-        given = self._misfit(_BODY, np.eye(3), axes)
-        if given < MIN_WRONG_SHARE * total:
+        misfit_as_sent = self._misfit(_BODY, np.eye(3), axes)
+        if misfit_as_sent < MIN_WRONG_SHARE * total:
             return None
         misfits = [(self._misfit(frame, matrix, axes), fits) for frame, matrix, fits in self._explanations()]
         best = min(misfit for misfit, _ in misfits)
-        if best > MAX_LEFT_SHARE * min(total, given):
+        if best > MAX_LEFT_SHARE * min(total, misfit_as_sent):
             return None
-        found, *others = (fits for misfit, fits in misfits if misfit <= EQUAL_FACTOR * best + 1e-3 * total)
+        best_fit, *others = (fits for misfit, fits in misfits if misfit <= EQUAL_FACTOR * best + 1e-3 * total)
         if others:
-            return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
-        return finding("IMU_CONTRADICTS", found=found)
+            return finding("IMU_CONTRADICTS_EITHER", found=best_fit, other=others[0])
+        return finding("IMU_CONTRADICTS", found=best_fit)
 
     def _misfit(self, frame: int, matrix: Array, observable: slice) -> float:
         """Return Σ|a - B w|² over the observable axes, for B (3, 3) and a frame of w."""

@@ -367,15 +367,15 @@ def held_out(held: HeldOutLegs, fit: DisplacementFit, parameters: Parameters) ->
     before = _velocity_errors(legs, ends, fit, np.zeros(N_ERRORS), parameters)
     sums = np.zeros(5)
     for fold, state in enumerate(held.states):
-        own = fold_of_leg == fold
-        if not own.any():
+        in_fold = fold_of_leg == fold
+        if not in_fold.any():
             continue
-        own_ends = [each for each, is_own in zip(ends, own, strict=True) if is_own]
-        after = _velocity_errors(legs, ends, fit, state.x, parameters)[own]
-        jacobian = _jacobian(legs, own_ends, fit, state.x, parameters)
+        fold_ends = [end for end, is_in_fold in zip(ends, in_fold, strict=True) if is_in_fold]
+        after = _velocity_errors(legs, ends, fit, state.x, parameters)[in_fold]
+        jacobian = _jacobian(legs, fold_ends, fit, state.x, parameters)
         calibration = float(np.einsum("nij,jk,nik->", jacobian, state.p, jacobian))
-        noise = float((of_all[own] ** 2).sum())
-        sums += [float((before[own] ** 2).sum()), float((after**2).sum()), noise + calibration, calibration, 0.0]
+        noise = float((of_all[in_fold] ** 2).sum())
+        sums += [float((before[in_fold] ** 2).sum()), float((after**2).sum()), noise + calibration, calibration, 0.0]
     return held_out_from_sums(len(ends), sums)
 
 

@@ -221,24 +221,24 @@ def _no_outliers(residual: Array, stretch: Index) -> Mask:
 
 def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Blocks:
     """Average the fixes in `use` (N,) over blocks of time, along some axes (0: east, 1: north, 2: up)."""
-    at = np.flatnonzero(use)
-    seconds = legs.seconds[at]
+    used = np.flatnonzero(use)
+    seconds = legs.seconds[used]
     length = max(BLOCK_S, float(seconds[-1] - seconds[0]) / MAX_BLOCKS)
     number = np.floor((seconds - seconds[0]) / length).astype(np.intp)
-    key = np.stack([legs.stretch[at], number])
+    key = np.stack([legs.stretch[used], number])
     first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))
-    weight = np.diff(np.append(first, len(at))).astype(float)
+    weight = np.diff(np.append(first, len(used))).astype(float)
 
     def mean(values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, first, axis=0)) / weight.reshape(-1, *[1] * (values.ndim - 1))
 
-    y, columns = mean(linear.y[at][:, axes]), mean(linear.columns[at][:, axes])
-    stretch = legs.stretch[at][first]
+    y, columns = mean(linear.y[used][:, axes]), mean(linear.columns[used][:, axes])
+    stretch = legs.stretch[used][first]
     # a stretch of one block holds no information, as its constant is free; of very many stretches the longest suffice
     numbers, sizes = np.unique(stretch, return_counts=True)
     longest = np.argsort(-sizes, kind="stable")
     sufficient = np.cumsum(sizes[longest]) <= max(2 * MAX_BLOCKS, int(sizes.max()))
-    kept = np.isin(stretch, numbers[longest[(sizes[longest] > 1) & sufficient]])
+    kept = np.isin(stretch, numbers[longest[(sizes[longest] > 1) & sufficient]])  # blocks
     return _Blocks(mean(seconds)[kept], stretch[kept], weight[kept], y[kept].T, columns[kept].swapaxes(0, 1))
 
 

@@ -93,11 +93,11 @@ class _NewestBlocks:
         variance = np.diagonal(r.noise, axis1=1, axis2=2)
         own_noise = np.full(len(block.dvl.times), np.trace(block.noise_dvl))
         columns = (*block.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), block.imu
-        for stream, own in zip(self._streams, columns, strict=True):
-            at = stream.extend(len(own[0]))
-            for name, values in zip(stream.LAYOUT, own, strict=True):
-                getattr(stream, name)[at] = values
-        self._blocks.append(tuple(len(own[0]) for own in columns))
+        for stream, own_columns in zip(self._streams, columns, strict=True):
+            rows = stream.extend(len(own_columns[0]))
+            for name, values in zip(stream.LAYOUT, own_columns, strict=True):
+                getattr(stream, name)[rows] = values
+        self._blocks.append(tuple(len(own_columns[0]) for own_columns in columns))
         if len(self._blocks) > KEPT_BLOCKS:
             for stream, n in zip(self._streams, self._blocks.popleft(), strict=True):
                 stream.forget_before(stream.begin + n)

@@ -37,7 +37,7 @@ class Assembler:
         self._n, self._m, self._model_noise = first.n_state, first.n_measurement, first.noise
         self._motion_is_noise = first.motion_is_noise
         priors = [prior(model, parameters) for model in self.models]
-        self.prior = GaussianState(np.array([each.x for each in priors]), np.array([each.p for each in priors]))
+        self.prior = GaussianState(np.array([begin.x for begin in priors]), np.array([begin.p for begin in priors]))
         given = initial or {}
         self._starts = [given.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
         self._floors = [_floor(model, parameters) for model in self.models]
@@ -95,16 +95,17 @@ class Assembler:
         gate = np.repeat(self._gate, n_samples, axis=1)
         for index, model in enumerate(self.models):
             axes = _dropped_axes(model, unmeasured)
-            at = np.flatnonzero(axes.any(axis=1))
-            if not len(at):
+            affected = np.flatnonzero(axes.any(axis=1))
+            if not len(affected):
                 continue
-            turned = unmeasured.rotation_reference_from_body[at] @ observations.rotation_dvl_from_body.T
-            kept = ~axes[at]
-            z[index, at] = np.einsum("nij,nj->ni", turned, z[index, at]) * kept
-            h[index, at] = turned @ h[index, at] * kept[:, :, None]
-            r = turned @ noise[index, at] @ turned.swapaxes(1, 2) * (kept[:, :, None] & kept[:, None, :])
-            noise[index, at] = r + np.eye(3) * axes[at, None, :]
-            gate[index, at] = self._gates[axes[at].sum(axis=1)]
+            turned = unmeasured.rotation_reference_from_body[affected] @ observations.rotation_dvl_from_body.T
+            is_measured = ~axes[affected]
+            z[index, affected] = np.einsum("nij,nj->ni", turned, z[index, affected]) * is_measured
+            h[index, affected] = turned @ h[index, affected] * is_measured[:, :, None]
+            both_measured = is_measured[:, :, None] & is_measured[:, None, :]
+            r = turned @ noise[index, affected] @ turned.swapaxes(1, 2) * both_measured
+            noise[index, affected] = r + np.eye(3) * axes[affected, None, :]
+            gate[index, affected] = self._gates[axes[affected].sum(axis=1)]
         return noise, gate
 
 

@@ -148,8 +148,7 @@ class Parameters:
         True, "Take default mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description."
     )
     publish_tf: bool = _parameter(
-        False,
-        "Broadcast ~/mounting as a static transform (needs tf2_ros). Only if no other node publishes that transform.",
+        False, "Broadcast ~/mounting as a static transform (needs tf2_ros), if no other node does so."
     )
     dvl_frame: str = _parameter(
         "", "frame_id that DVL messages must carry. Empty: the first one that is neither body nor earth."
@@ -336,10 +335,7 @@ class Parameters:
     )
     min_speed: float = _parameter(0.3, "Slower samples are not used. 0: off.", unit="m/s", within=(0.0, 10.0))
     max_turn_rate: float = _parameter(
-        0.0,
-        "Samples in faster turns, or without angular velocity, are not used. 0: off.",
-        unit="rad/s",
-        within=(0.0, 10.0),
+        0.0, "Samples that turn faster or lack angular velocity are not used. 0: off.", unit="rad/s", within=(0.0, 10.0)
     )
     max_repeats: float = _parameter(
         0.0,

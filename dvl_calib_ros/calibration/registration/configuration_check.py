@@ -141,9 +141,8 @@ def fitting_configuration(
         assert registration is not None
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
         max_ratio = min(MAX_SIGN_RATIO, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
-        return wrong_axes(
-            motion, curves, nominal, lever_arm, max_ratio * registration.spread, parameters.dvl_axes, SIGNS
-        )
+        level = max_ratio * registration.spread
+        return wrong_axes(motion, curves, nominal, lever_arm, level, parameters.dvl_axes, SIGNS)
     fits = {}
     for frame in _FRAMES:
         in_frame = _fit_in_frame(MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS), nominal)
