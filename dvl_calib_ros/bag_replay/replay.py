@@ -179,7 +179,11 @@ class Recorder:
 def _model_history(
     estimate: Estimate, calibrator: Calibrator, trace: StateTrace, numbers: Stamps, stamps_ns: Stamps
 ) -> ModelHistory:
-    """Return a model's state, σ and NIS at the given times and at the end."""
+    """Return a model's state, σ and NIS at the given times and at the end.
+
+    numbers: (N,) numbers of the rows after which the state is shown.
+    stamps_ns: (N,) their stamps.
+    """
     name = estimate.model
     nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
     states, covariances = [estimate.state[None]], [estimate.recording_covariance[None]]

@@ -376,20 +376,26 @@ class _Search:
         dvl: Preview,
         reference: Preview,
         imu: Preview | None,
-        known: Array | None,
+        mounting: Array | None,
         placed: Placed | None,
     ) -> FrameChoice | None:
-        """Choose the frames under which DVL and reference agree best; None without common motion."""
+        """Choose the frames under which DVL and reference agree best; None without common motion.
+
+        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
+        """
         position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
         motion = compared_motion(dvl, reference, imu)
         if motion is None:
             return None
         self._readings = Readings(motion, position)
         is_known = _is_located(placed) and self._known_reference_position(reference) is not None
-        return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
+        return frames.choose(self._readings, reference, None if mounting is None else mounting.T, is_known)
 
-    def _use_reading(self, chosen: Agreement, known: Array | None, reference: Preview, imu: Preview | None) -> None:
-        """Write the frames and mounting of a reading into the parameters."""
+    def _use_reading(self, chosen: Agreement, mounting: Array | None, reference: Preview, imu: Preview | None) -> None:
+        """Write the frames and mounting of a reading into the parameters.
+
+        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
+        """
         reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)
         if declared is not None:
@@ -410,7 +416,7 @@ class _Search:
                 self._contradictions.append(finding("REFERENCE_FRAME_OTHER", topic=reference.topic, **frame))
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
-        if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < MAX_RESIDUAL:
+        if mounting is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < MAX_RESIDUAL:
             residual = self._readings.registered(reading, np.eye(3)).residual
             turned_residual, rotation, *_ = self._readings.registered(reading, None)
             if self._readings.without_noise(turned_residual) < BETTER_BY * self._readings.without_noise(residual):
@@ -422,8 +428,11 @@ class _Search:
                 level_residual, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
                 self._mounting_found(level if BETTER * level_residual <= turned_residual else rpy, why)
 
-    def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Preview, reference: Preview) -> None:
-        """Set the noise of a reference that claims none, far too little, or more than its velocities show."""
+    def _measure_noise(self, chosen: Agreement, mounting: Array | None, dvl: Preview, reference: Preview) -> None:
+        """Set the noise of a reference that claims none, far too little, or more than its velocities show.
+
+        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
+        """
         if self._is_given("gnss_aided_std") or self._is_given("use_message_covariance"):
             return
         says_nothing = "use_message_covariance" in self._values
@@ -444,7 +453,7 @@ class _Search:
             too_little or claims_none or says_nothing or (may_claim_less and most > max(least * per_axis, QUIETEST))
         ):
             return
-        best, *_ = self._readings.registered(chosen.reading, None if known is None else known.T)
+        best, *_ = self._readings.registered(chosen.reading, None if mounting is None else mounting.T)
         noise = max(max(min(best, chosen.best_residual), least) * per_axis, QUIETEST)
         too_much = may_claim_less and most > noise
         if not (too_much or too_little or claims_none or says_nothing):
@@ -477,10 +486,10 @@ class _Search:
         self._mounting_because = why
         self._notes.append(mounting_guessed(rpy, why))
 
-    def _mounting_from_motion(self, dvl: Preview, turned: bool, known: Array | None) -> None:
+    def _mounting_from_motion(self, dvl: Preview, turned: bool, mounting: Array | None) -> None:
         """Guess the mounting without a reference, assuming a vehicle that drives ahead, as the models without GNSS do.
 
-        known: rotation_body_from_dvl (3, 3), None if unknown.
+        mounting: rotation_body_from_dvl (3, 3), None if unknown.
         """
         velocity = dvl.values @ FLU_FROM_FRD if turned else dvl.values
         if not len(velocity):
@@ -491,14 +500,14 @@ class _Search:
         ahead = np.tile([np.linalg.norm(mean), 0.0, 0.0], (2, 1))
         rotation_dvl_from_body = best_rotation(np.tile(mean, (2, 1)), ahead, np.eye(3))
         yaw = math.atan2(rotation_dvl_from_body[0, 1], rotation_dvl_from_body[0, 0])
-        if known is not None:
-            ahead_in_body = known @ mean
+        if mounting is not None:
+            ahead_in_body = mounting @ mean
             is_sideways = abs(ahead_in_body[1]) > abs(ahead_in_body[0])
             if (is_sideways or ahead_in_body[0] < 0.0) and not self._is_given("mounting_rpy"):
-                configured, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
+                configured, fits = rpy_from_rotation(mounting) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
                 fields = {"given": in_degrees(configured), "found": in_degrees(fits), "option": as_option(fits)}
                 code = "TRAVELS_SIDEWAYS" if is_sideways else "TRAVELS_ASTERN"
-                self._contradictions.append(finding(code, also=_other_axes(known, mean), **fields))
+                self._contradictions.append(finding(code, also=_other_axes(mounting, mean), **fields))
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 

@@ -63,7 +63,10 @@ class Gravity(NamedTuple):
     def contradiction(
         self, topic: str, rotation_body_from_imu: Array, world: str, z_down: bool = False
     ) -> Reason | None:
-        """Return the contradiction between gravity and an assumed convention of the IMU's data."""
+        """Return the contradiction between gravity and an assumed convention of the IMU's data.
+
+        rotation_body_from_imu: (3, 3). world: frame of the orientation, as imu_frame. z_down: of base_frame.
+        """
         body_up, up = self._up_in_body(rotation_body_from_imu, z_down), self._up(world)
         if body_up < -CLEARLY and up < -CLEARLY:
             return finding("GRAVITY_SIGN", topic=topic)

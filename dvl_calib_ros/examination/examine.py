@@ -291,7 +291,10 @@ def _body_velocity(dvl: Recorded, look: Preview | None, parameters: Parameters) 
 
 
 def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Reason]:
-    """Return all problems of the streams, errors first; consequences of a reported problem are left out."""
+    """Return all problems of the streams, errors first; consequences of a reported problem are left out.
+
+    velocity: (N, 3) m/s, of the DVL in the body.
+    """
     dvl, reference, imu = streams["dvl"], streams.get("reference"), streams.get("imu")
     over_legs = reference is not None and _is_compared_over_legs(reference)
     found: list[Reason] = []

@@ -116,7 +116,11 @@ class Selection:
             self._update(stamps_ns, paired, parameters)
 
     def _update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
-        """Take samples one by one where GNSS availability changes."""
+        """Take samples one by one where GNSS availability changes.
+
+        stamps_ns: (N,) of the DVL samples.
+        paired: (N,) whether each has a reference velocity.
+        """
         timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
         if parameters.model == AUTO:
             paired = paired | (stamps_ns < self._referenced_until_ns)

@@ -231,6 +231,8 @@ def held_out_error(
     """Return the error of a model on every fold by the state without it; None for too few samples.
 
     without: one state for each fold.
+    moments: sums over the samples of each fold.
+    rotation_dvl_from_body: (3, 3) nominal mounting.
     """
     samples = int(moments.in_fold(None).samples)
     if samples < FEWEST_SAMPLES or max(moments.in_fold(fold).samples for fold in range(FOLDS)) == samples:

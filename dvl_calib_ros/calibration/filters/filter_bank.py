@@ -205,7 +205,11 @@ class Group:
         self._of_recording.clear()
 
     def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
-        """Update the models. A model with non-finite numbers keeps its previous state and is counted."""
+        """Update the models. A model with non-finite numbers keeps its previous state and is counted.
+
+        process: (N, K, n, n) covariance added before each sample, None for none.
+        ends: numbers of samples after which the states are returned, too.
+        """
         try:
             after = _filtered(self._x, self._p, data, process, ends)
             if _is_sound(after.x, after.p):

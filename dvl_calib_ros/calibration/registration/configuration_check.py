@@ -169,7 +169,10 @@ class _FrameFit(NamedTuple):
 
 
 def _fit_in_frame(fit: MotionFit, nominal: Array) -> _FrameFit | None:
-    """Return the best fit of the configured mounting, of it with body or DVL axes rotated, and of a free one."""
+    """Return the best fit of the configured mounting, of it with body or DVL axes rotated, and of a free one.
+
+    nominal: (3, 3) rotation_body_from_dvl as configured.
+    """
     body_turned, dvl_turned = FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD
     give_up_above = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
     by_mounting = [nearest(fit, start, most=give_up_above) for start in (nominal, body_turned, dvl_turned, None)]
@@ -238,6 +241,8 @@ def wrong_axes(
 
     Each sign pattern has its own delay, because in waves a delay of half a period looks like a sign. The axis factors
     of the best pattern decide. most: largest residual, m/s per axis. patterns: signs, that of the axis ahead first.
+
+    nominal: (3, 3) rotation_body_from_dvl as configured. lever_arm: (3,) m.
     """
     ahead = int(np.argmax((motion.dvl.velocity**2).sum(axis=0)))
     others = [axis for axis in range(3) if axis != ahead]
@@ -309,7 +314,11 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
 def _configuration_finding(
     declared: VelocityFrame, best: VelocityFrame, rotation: Array, parameters: Parameters, also_turned: bool
 ) -> Reason | None:
-    """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
+    """Return the finding that names the best configuration. also_turned: rotated body axes fit as well.
+
+    declared, best: configured and best-fitting frame of the reference.
+    rotation: (3, 3) best-fitting rotation_body_from_dvl.
+    """
     nominal = parameters.rotation_dvl_from_body.T
     same_frame, same_mounting = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
     if same_frame and same_mounting:  # a large misalignment is left to the calibration

@@ -2,6 +2,9 @@
 
 Correlation over all delays within a minute selects candidates (`delay_search`), least squares refines them
 (`gauss_newton`). The IMU's clock is the time base, because its attitude rotates the reference into the body.
+
+Arguments in this module: `rotation` (3, 3) is the rotation_body_from_dvl of the prior mounting, None to estimate it;
+`lever_arm` (3,) m is the configured one; ρ and δ (rho, delta) are delays in s.
 """
 
 from __future__ import annotations
