@@ -143,7 +143,7 @@ def _own_sections(
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
     if not own_sections:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
-        raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
+        raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; name '/**:' or the node")
     return [(name, _flattened(body)) for name, body in own_sections]
 
 

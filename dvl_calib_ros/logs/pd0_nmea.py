@@ -138,15 +138,17 @@ class Nmea:
         return stamps, values[:, 0]
 
     def _in_order(self, kind: str) -> tuple[list[int], Array]:
-        """Return stamps (ns) and values of one kind of sentence, with the sign of DT that spaces them most evenly."""
-        own = self._found[kind]
-        if not own:
+        """Return stamps (ns) and values of one kind of sentence, in order.
+
+        The sign of the time difference to the ensemble is the one that spaces the stamps most evenly.
+        """
+        if not self._found[kind]:
             return [], np.zeros((0, 2))
-        at = np.array([stamp_ns for stamp_ns, _, _ in own])
-        delta_ns = np.array([round(1e9 * delta) for _, delta, _ in own])
-        stamps = min((at - delta_ns, at + delta_ns), key=_unevenness)
+        ensemble_ns, differences_s, values = zip(*self._found[kind], strict=True)
+        difference_ns = np.array([round(1e9 * seconds) for seconds in differences_s])
+        stamps = min((np.array(ensemble_ns) - difference_ns, np.array(ensemble_ns) + difference_ns), key=_unevenness)
         stamps, index = np.unique(stamps, return_index=True)
-        return stamps.tolist(), np.array([own[i][2] for i in index])
+        return stamps.tolist(), np.array([values[i] for i in index])
 
 
 def _unevenness(stamps: np.ndarray) -> float:

@@ -93,12 +93,16 @@ class RemainingTime:
 
     def __init__(self) -> None:
         self._ends_s: deque[tuple[float, float]] = deque()  # time of each prediction, and the predicted end
-        self._latest_s, self._longer_since_s = math.inf, -math.inf  # latest promised end
-        self._promised_at = math.nan  # drift when it was promised
+        self._latest_s, self._longer_since_s = math.inf, -math.inf  # latest predicted end
+        self._drift_then = math.nan  # m per km, when that end was predicted
         self.longer: Reason | None = None
 
-    def look(self, seconds: float | None, drift: float, now_s: float) -> float | None:
-        """Add a prediction (s; None: unknown). Return the median remaining time, s. drift: m per km, as displayed."""
+    def add(self, seconds: float | None, drift: float, now_s: float) -> float | None:
+        """Add a prediction, and return the median of the last predictions of the remaining time, s.
+
+        seconds: predicted remaining time, None if unknown. drift: predicted drift, m per km, as displayed.
+        If the median end is later than any end predicted before, `longer` tells why.
+        """
         if now_s - self._longer_since_s >= STANDS_S:
             self.longer = None
         self._ends_s.append((now_s, math.inf if seconds is None else now_s + seconds))
@@ -108,10 +112,10 @@ class RemainingTime:
         remaining = max(end_s - now_s, 0.0)
         latest_s = end_s + SPREAD * remaining
         if end_s > self._latest_s:
-            code = "LONGER_AS_DRIFT_GREW" if drift > self._promised_at else "LONGER_AS_LITTLE_SHOWN"
-            self.longer, self._longer_since_s = finding(code, before=self._promised_at, now=drift), now_s
+            code = "LONGER_AS_DRIFT_GREW" if drift > self._drift_then else "LONGER_AS_LITTLE_SHOWN"
+            self.longer, self._longer_since_s = finding(code, before=self._drift_then, now=drift), now_s
         if latest_s < self._latest_s or end_s > self._latest_s:
-            self._latest_s, self._promised_at = latest_s, drift
+            self._latest_s, self._drift_then = latest_s, drift
         return remaining if math.isfinite(remaining) else None
 
 
@@ -196,7 +200,7 @@ class Card:
         if rejected or worth.is_good:
             self._remaining = RemainingTime()
         elif plan.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
-            remaining = self._remaining.look(plan.seconds, drift.both, self._shown_s)
+            remaining = self._remaining.add(plan.seconds, drift.both, self._shown_s)
         initial = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goal = PredictedDrift.goals(parameters)
         goals = {

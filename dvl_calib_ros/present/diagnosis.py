@@ -50,7 +50,7 @@ ALL = "all of the run"
 MAX_PLACES = 12
 # effects on the first screen of a terminal
 FIRST_EFFECTS = 3
-PLACES = "Share: of the gap's energy. Places overlap; only the shares of the axes over the whole run add up."
+PLACES = "Share: of the gap's energy. Places overlap; only the axes, over the whole run, add up to all of it."
 EFFECTS_NOTE = (
     "The calibration is refitted with every effect. p is adjusted for all effects tried. For names joined by "
     "“or”, the parameters are those of the first."

@@ -335,7 +335,11 @@ DRIFT_NOTE = (
 
 
 def cross_check(check: CrossCheck) -> Document:
-    """Lay out the errors of each bag's calibration on every other bag."""
+    """Lay out the errors of each bag's calibration on every other bag.
+
+    Rows: calibrating bags and models. Columns: bags that are corrected. First drift of dead reckoning, with a picture
+    per bag, then the velocity error.
+    """
     heading, uncalibrated = ("calibrated on", "model", *check.names), ("nothing", "uncalibrated")
     errors = [(*uncalibrated, *(number(value, 4) for value in check.uncorrected.tolist()))]
     for name, by_model in zip(check.names, check.corrected, strict=True):

@@ -98,25 +98,28 @@ class _Cut:
 def _block(
     stream: Stream, decoded: Sequence[DecodedRows], singles: Sequence[Iterator[Row]], decoder: MessageDecoder
 ) -> SampleBlock:
-    """Return the samples of one stream, in order of arrival."""
+    """Return the samples of one stream, in order of arrival.
+
+    decoded: messages of fixed layouts. singles: messages that are decoded individually.
+    """
+    judge: Callable[[str], object]
+    decode: Callable[[Any, int], Decoded]
+    judge, decode = {
+        Stream.DVL: (decoder.accepts_dvl_frame, decoder.dvl),
+        Stream.REFERENCE: (decoder.reference_frame, decoder.reference),
+        Stream.IMU: (decoder.note_imu_frame, decoder.imu),
+    }[stream]
     # a frame is judged at its first message: the DVL's first frame is the DVL's own
-    pending = deque(sorted(first for each in decoded for first in _first_of_frames(each)))
-    judge: Callable[[str], object] = {
-        Stream.DVL: decoder.accepts_dvl_frame, Stream.REFERENCE: decoder.reference_frame,
-        Stream.IMU: decoder.note_imu_frame,
-    }[stream]  # fmt: skip
-    rows: list[tuple[int, Decoded]] = []
-    decode: Callable[[Any, int], Decoded] = {
-        Stream.DVL: decoder.dvl, Stream.REFERENCE: decoder.reference, Stream.IMU: decoder.imu
-    }[stream]  # fmt: skip
+    pending = deque(sorted(first for rows in decoded for first in _first_of_frames(rows)))
+    samples: list[tuple[int, Decoded]] = []
     for arrival, log_ns, message, why in heapq.merge(*singles, key=lambda row: row[0]):
         while pending and pending[0][0] < arrival:
             judge(pending.popleft()[1])
-        rows.append((arrival, decoder.undecodable(stream, why) if why else decode(message, log_ns)))
+        samples.append((arrival, decoder.undecodable(stream, why) if why else decode(message, log_ns)))
     for _, name in pending:
         judge(name)
     make = _imu if stream is Stream.IMU else _velocity
-    blocks = [make(stream, each, decoder) for each in decoded] + ([_of_rows(stream, rows)] if rows else [])
+    blocks = [make(stream, rows, decoder) for rows in decoded] + ([_of_rows(stream, samples)] if samples else [])
     if not blocks:
         return no_samples(stream)
     if len(blocks) == 1:

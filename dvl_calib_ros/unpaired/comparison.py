@@ -202,19 +202,23 @@ def _is_significant(slopes: Slopes, name: str) -> bool:
 
 
 def at_one_motion(sides: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
-    """Scale the noise to a common motion of both sides, by the significant growth."""
-    columns = [[_covariates(recorded) for recorded in side] for side in sides]
-    names = [name for name in SPREAD if any(name in slope and _is_significant(slope, name) for slope in slopes)]
+    """Scale the noise of both sides to a common motion, by the significant growth of each side.
+
+    sides: noise of the recordings of vehicle and simulator. slopes: growth of both.
+    """
     scaled = [list(side) for side in sides]
-    for name in names:
-        if not all(name in recorded for side in columns for recorded in side):
+    for name in SPREAD:
+        grows = [name in slope and _is_significant(slope, name) for slope in slopes]
+        covariates = [[_covariates(recorded) for recorded in side] for side in sides]
+        if not any(grows) or not all(name in known for side in covariates for known in side):
             continue
-        mean = float(np.mean([np.mean(np.concatenate([recorded[name] for recorded in side])) for side in columns]))
-        for side, slope, own_columns in zip(scaled, slopes, columns, strict=True):
-            if name in slope and _is_significant(slope, name):
-                for index, each in enumerate(side):
-                    quieter = np.exp(-slope[name][0] * (own_columns[index][name] - mean))
-                    side[index] = replace(each, values=each.values * quieter[:, None])
+        values = [[known[name] for known in side] for side in covariates]
+        common = float(np.mean([np.mean(np.concatenate(side)) for side in values]))
+        for side in (side for side in range(len(sides)) if grows[side]):
+            for index, value in enumerate(values[side]):
+                factor = np.exp(-slopes[side][name][0] * (value - common))
+                noise = scaled[side][index]
+                scaled[side][index] = replace(noise, values=noise.values * factor[:, None])
     return scaled
 
 

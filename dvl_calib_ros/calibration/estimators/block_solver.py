@@ -184,10 +184,10 @@ class BlockSolver:
         self._dvl_stream.add(block.dvl.velocity[(stamps_ns >= block.from_ns) & (stamps_ns < block.end_ns)])
         self._claims += 2 * int(np.count_nonzero(reference.claimed)) - len(reference.times)
         from_s, to_s = seconds(np.array([block.from_ns, block.end_ns]), self.epoch_ns).tolist()
-        kept = ThinnedBlock.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
-        self._clocks.add(kept, streams.raw.frames, block.from_ns)
+        thinned = ThinnedBlock.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
+        self._clocks.add(thinned, streams.raw.frames, block.from_ns)
         if self.kept is not None:
-            self.kept.append(kept)
+            self.kept.append(thinned)
 
     def _fit_block(self, streams: Cleaned) -> FitBlock:
         """Return the part of a block that the fit keeps."""

@@ -362,7 +362,11 @@ class JointFit:
         return sections
 
     def _measure_noise(self, day: _Day, parts: Sequence[SectionRows]) -> None:
-        """Estimate the white noise of single rows and of bins from their scatter within sections."""
+        """Estimate a day's noise from the scatter of its sections; see the fields of `_Day`.
+
+        single: variance of rows about their section's median. white: variance of bins about a line per section.
+        level, level_std: median of the sections' medians and their scatter, by which gross sections are rejected.
+        """
         residuals = [part.residual for part in parts if part.rows is not None]
         if not residuals:
             return

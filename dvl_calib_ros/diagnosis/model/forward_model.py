@@ -248,7 +248,11 @@ class Problem:
         return found
 
     def _moved(self, hypothesis: Hypothesis, recording: int, time: Array, unsmoothed: bool = False) -> _Moved:
-        """Return the DVL's motion at true times (F,) s. unsmoothed: without smoothing a slow DVL."""
+        """Return the motion by the DVL at true times (F,) s, under a hypothesis.
+
+        The measured velocity is rotated to the body. The hypothesis's effects on the DVL are then removed, then the
+        lever arm's velocity, then the effects on the motion. unsmoothed: without smoothing a slow DVL.
+        """
         stream, injections = self.recordings[recording], hypothesis.injections(recording)
         dvl, attitude = (time + late(injections, clock, time) for clock in (ActsOn.DVL_CLOCK, ActsOn.ATTITUDE_CLOCK))
         rotation, rates = self._oriented(stream, attitude)

@@ -177,8 +177,10 @@ def linearised(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Linea
 
 
 def _gram(problem: Problem, noise: Noise, columns: Array, target: Array) -> Array:
-    """Return the Gram matrix (n + 1, n + 1) of whitened columns (M, A, n) and target (M, A), summed by recording. A
-    recording's own parameters have zero columns in others."""
+    """Return the Gram matrix (n + 1, n + 1) of whitened columns (M, A, n) and target (M, A), summed by recording.
+
+    A parameter of one recording has a zero column in the others. Zero columns are left out, because whitening is slow.
+    """
     total = np.zeros((columns.shape[2] + 1,) * 2)
     for rows in problem.rows_of:
         part, noise_of = columns[rows], noise.part(rows)

@@ -205,7 +205,7 @@ def told_of(predictions, drifts):
     remaining, latest, told = RemainingTime(), math.inf, []
     for number, (seconds, drift) in enumerate(zip(predictions, drifts, strict=True)):
         now_s = 5.0 * number
-        left = remaining.look(seconds, drift, now_s)
+        left = remaining.add(seconds, drift, now_s)
         code = "" if remaining.longer is None else remaining.longer.code
         told.append((now_s, left, latest, code))
         end_s = math.inf if left is None else now_s + left
