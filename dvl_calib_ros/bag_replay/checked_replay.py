@@ -121,7 +121,7 @@ def checked_replay(
         )  # fmt: skip
     if contradictions:
         result = replayed.result
-        judged = {name: _with_frame_doubts(each, contradictions) for name, each in result.verifications.items()}
+        judged = {name: _with_frame_doubts(verified, contradictions) for name, verified in result.verifications.items()}
         replayed = replace(replayed, result=replace(result, verifications=judged))
     return replayed if recordings is None else _with_common_verdict(replayed, recordings, merge)
 

@@ -91,14 +91,14 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
             channel = batch.channels[int(batch.number[index[0]])]
             position = np.concatenate([position for *_, position in chunks])
             if channel.topic in one_by_one or not length:
-                data = [each for batch, index, _ in chunks for each in batch.part(index).data()]
+                data = [message for batch, index, _ in chunks for message in batch.part(index).data()]
                 parts.append(Part(channel, position + arrived, log_ns[position], None, data, bag.decoder))
                 continue
             rows_of = [batch.rows(index, length) for batch, index, _ in chunks]
             contents = rows_of[0] if len(rows_of) == 1 else np.concatenate(rows_of)
             for columns, rows in layouts.split(channel, contents):
                 positions = position if len(rows) == len(position) else position[rows]
-                data = [] if columns is not None else [each.tobytes() for each in contents[rows]]
+                data = [] if columns is not None else [row.tobytes() for row in contents[rows]]
                 parts.append(Part(channel, positions + arrived, log_ns[positions], columns, data, bag.decoder))
         arrived += len(log_ns)
         yield Window(parts, int(log_ns[-1]))

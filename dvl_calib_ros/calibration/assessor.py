@@ -308,7 +308,7 @@ class NonlinearEstimators:
     @property
     def affected_from_ns(self) -> int | None:
         """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
-        return min((until for each in self._all if (until := each.affected_from_ns) is not None), default=None)
+        return min((until for model in self._all if (until := model.affected_from_ns) is not None), default=None)
 
     @property
     def reference_claims(self) -> bool:

@@ -194,7 +194,7 @@ def on_imu_clock(recording: Recording, topics: Topics, registration: Registratio
 
 def _thinned(preview: Preview) -> Preview:
     step = -(-len(preview.stamps_s) // COMPARED)
-    rates, pose = (None if each is None else each[::step] for each in (preview.rates, preview.pose))
+    rates, pose = (None if column is None else column[::step] for column in (preview.rates, preview.pose))
     return replace(preview, stamps_s=preview.stamps_s[::step], values=preview.values[::step], rates=rates, pose=pose)
 
 

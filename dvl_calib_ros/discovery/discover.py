@@ -124,7 +124,7 @@ class _Search:
         previews = self._survey.previews
         dvl, reference, imu = previews.get(topics.dvl), previews.get(topics.gnss), previews.get(topics.imu)
         if dvl is not None:
-            self._choose_frames(dvl, *(in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
+            self._choose_frames(dvl, *(in_time_of(dvl, preview, self._parameters) for preview in (reference, imu)))
         self._found.insert(0, self._describe_topics(topics))
         return Discovery(
             topics,

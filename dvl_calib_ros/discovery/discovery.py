@@ -78,7 +78,7 @@ class Discovery:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Warnings for the user."""
-        return tuple(each.sentence for each in (*self.contradictions, *self.notes))
+        return tuple(reason.sentence for reason in (*self.contradictions, *self.notes))
 
     def document(self) -> dict[str, Any]:
         """Return plain data for JSON: topics, findings, warnings."""

@@ -401,7 +401,7 @@ def _observability(replayed: Replayed) -> tuple[Shown, ...]:
     if not result.estimate.used:
         return ()
     parameters = Parameters.from_mapping(result.parameters)
-    return tuple(_one_shown(each, result.estimate, parameters) for each in quantities(result) if each.name in _NAMES)
+    return tuple(_one_shown(term, result.estimate, parameters) for term in quantities(result) if term.name in _NAMES)
 
 
 def _one_shown(quantity: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:

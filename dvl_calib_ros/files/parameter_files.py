@@ -88,7 +88,7 @@ def _in_radians(value: Any) -> Any:
     if isinstance(value, str):
         parts = re.sub(r"\s+(?=deg|°)", "", value).replace(",", " ").split()
         return [_number_or_degrees(part) for part in parts] if len(parts) > 1 else _number_or_degrees(value)
-    return [_number_or_degrees(each) for each in value] if isinstance(value, list) else value
+    return [_number_or_degrees(element) for element in value] if isinstance(value, list) else value
 
 
 def _number_or_degrees(value: Any) -> Any:

@@ -72,15 +72,15 @@ class Urdf:
             if above in chain:
                 raise InputError(f"{self.path}: joint {above.name} is its own ancestor")
             chain.insert(0, above)
-        for each in chain:
-            if each.kind != "fixed":
-                what = f"joint {each.name} between {base} and the DVL is {each.kind}"
+        for member in chain:
+            if member.kind != "fixed":
+                what = f"joint {member.name} between {base} and the DVL is {member.kind}"
                 raise InputError(f"{self.path}: {what}; only fixed joints make a mounting")
         rotation, position = np.eye(3), np.zeros(3)
-        for each in chain:
+        for member in chain:
             parent = rotation
-            position = position + rotation @ each.xyz
-            rotation = rotation @ rotation_from_rpy(each.rpy)
+            position = position + rotation @ member.xyz
+            rotation = rotation @ rotation_from_rpy(member.rpy)
         return UrdfMounting(chain[-1], rotation, parent, position)
 
     def _joint(self, name: str) -> Joint:

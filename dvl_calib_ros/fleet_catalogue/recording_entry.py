@@ -328,7 +328,7 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
     if result.first_ns is not None and result.last_ns is not None:
         common |= {"first_ns": result.first_ns, "last_ns": result.last_ns}
         common["day"] = _day(result.first_ns)
-    extrinsics, without_day = (extrinsics_of_replay(each, where) for each in (replayed, _without_day(replayed)))
+    extrinsics, without_day = (extrinsics_of_replay(variant, where) for variant in (replayed, _without_day(replayed)))
     extrinsics_row = None
     if extrinsics is not None and without_day is not None:
         extrinsics_row = {**_plain_data(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}

@@ -161,7 +161,7 @@ def _ensembles(content: bytes) -> Iterator[list[tuple[int, bytes]]]:
         if 6 + 2 * n_types > len(body):
             continue
         offsets = struct.unpack_from(f"<{n_types}H", body, 6)
-        yield [(struct.unpack_from("<H", body, each)[0], body[each:]) for each in offsets if each + 2 <= len(body)]
+        yield [(struct.unpack_from("<H", body, part)[0], body[part:]) for part in offsets if part + 2 <= len(body)]
 
 
 def _read_pd0(path: Path, content: bytes) -> DvlLog:

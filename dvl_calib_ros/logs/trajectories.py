@@ -422,9 +422,9 @@ def _column_index(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
     """Return the index of a column by its name, its name without the unit, or its number. Raises InputError."""
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     key = name.strip().lower()
-    for each in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
-        if key in each:
-            return each.index(key)
+    for names in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
+        if key in names:
+            return names.index(key)
     if key.isdecimal() and 0 < int(key) <= len(header):
         return int(key) - 1
     raise InputError(f"{path}: --columns: no column {name!r}; there are {', '.join(header)[:SHOWN] or 'none'}")

@@ -85,8 +85,8 @@ class DeclaredFrame(NamedTuple):
 
 # by value of parameter gnss_frame
 DECLARED_FRAMES = {
-    each.name: each
-    for each in (
+    declared.name: declared
+    for declared in (
         *map(DeclaredFrame, VelocityFrame),
         *(DeclaredFrame(VelocityFrame.BODY, HALF_TURN, axes) for axes in (FLU, FRD)),
         DeclaredFrame(VelocityFrame.ENU, QUARTER_TURN),

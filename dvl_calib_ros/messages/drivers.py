@@ -296,8 +296,8 @@ _FEW_BEAMS = Rule(
 
 # extended by recognised types (field_map.py)
 VELOCITY_TYPES: dict[str, VelocityType] = {
-    each.name: each
-    for each in (
+    kind.name: kind
+    for kind in (
         VelocityType(
             name=TWIST_TYPE,
             sent_by="any driver, the default",
@@ -465,10 +465,10 @@ VELOCITY_TYPES: dict[str, VelocityType] = {
 _WRITTEN = tuple(VELOCITY_TYPES.values())
 # for bags without message definitions
 KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
-    name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions
+    name: kind.definitions for name, kind in VELOCITY_TYPES.items() if kind.definitions
 }
-DVL_TYPES = {name: each for name, each in VELOCITY_TYPES.items() if each.is_dvl}
-REFERENCE_TYPES = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
+DVL_TYPES = {name: kind for name, kind in VELOCITY_TYPES.items() if kind.is_dvl}
+REFERENCE_TYPES = {name: kind for name, kind in VELOCITY_TYPES.items() if kind.is_reference}
 # allowed values of these parameters
 TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": DVL_TYPES, "gnss_type": REFERENCE_TYPES}
 
@@ -513,14 +513,15 @@ def velocity_type(parameter: str, name: str) -> VelocityType:
 def driver_table() -> str:
     """Return the documentation's table of message types, in Markdown."""
     lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
-    for each in _WRITTEN:
-        axes = ", forward-right-down" if each.points_down else ", forward-left-up" if each.is_dvl else ""
+    for written in _WRITTEN:
+        axes = ", forward-right-down" if written.points_down else ", forward-left-up" if written.is_dvl else ""
         # most types have zero_velocity, which the page explains once
         rules = "; ".join(
-            f"`{rule.counter}`" + (f": {rule.says}" if rule.counter != "zero_velocity" else "") for rule in each.rules
+            f"`{rule.counter}`" + (f": {rule.says}" if rule.counter != "zero_velocity" else "")
+            for rule in written.rules
         )
         lines.append(
-            f"| {each.name.replace('/msg/', '/')} | {each.sent_by} | {each.frame_says}{axes} | "
-            f"{each.covariance_says} | {rules} |"
+            f"| {written.name.replace('/msg/', '/')} | {written.sent_by} | {written.frame_says}{axes} | "
+            f"{written.covariance_says} | {rules} |"
         )
     return "\n".join(lines) + "\n"

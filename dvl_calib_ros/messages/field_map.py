@@ -176,10 +176,10 @@ class _Fields(NamedTuple):
 
     def walk(self, description: Description, prefix: str = "") -> Iterator[tuple[str, Description]]:
         """Yield all paths below a message except the header's, with their descriptions."""
-        for name, each in self.of(description).items():
+        for name, kind in self.of(description).items():
             if prefix or name != "header":
-                yield prefix + name, each
-                yield from self.walk(each, f"{prefix}{name}.")
+                yield prefix + name, kind
+                yield from self.walk(kind, f"{prefix}{name}.")
 
     def is_number(self, description: Description) -> bool:
         kind, detail = description
@@ -240,7 +240,7 @@ def _is_three(fields: _Fields, description: Description) -> bool:
 
 
 def _listed(fields: _Fields, description: Description) -> str:
-    names = [path for path, each in fields.walk(description) if not fields.of(each)]
+    names = [path for path, kind in fields.walk(description) if not fields.of(kind)]
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return (", ".join(names[:_NAMED]) or "none but its header") + more
 

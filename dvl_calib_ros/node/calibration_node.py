@@ -317,7 +317,7 @@ class CalibrationNode(AnsweringNode):
     def deliver(self, ready: Collection[Subscription] | None = None) -> None:
         """Feed all waiting messages. ready: the only subscriptions with waiting messages, if known."""
         inputs = self._inputs.items()
-        self._deliver({}, None if ready is None else [topic for topic, each in inputs if each in ready])
+        self._deliver({}, None if ready is None else [topic for topic, subscription in inputs if subscription in ready])
 
     def _deliver(self, taken: Mapping[str, Arrived], ready: Collection[str] | None = None) -> None:
         """Feed the messages taken, by topic, and all waiting ones."""

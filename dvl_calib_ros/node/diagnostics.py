@@ -142,9 +142,9 @@ class Silence:
         }
         # the newest sample of a live stream may be some time old
         faults = {}
-        for each in arrival_offset(ahead, parameters, SILENCE_S):
-            names = {"stream": _NAMED[each.stream], "side": each.side, "other": _NAMED[each.other]}
-            faults[each.stream.value] = finding("CLOCKS_DIFFER", seconds=abs(each.ahead), **names)
+        for offset in arrival_offset(ahead, parameters, SILENCE_S):
+            names = {"stream": _NAMED[offset.stream], "side": offset.side, "other": _NAMED[offset.other]}
+            faults[offset.stream.value] = finding("CLOCKS_DIFFER", seconds=abs(offset.ahead), **names)
         return faults
 
 
@@ -207,8 +207,8 @@ def diagnose(
         **_cause_values(cause_of_scale(MODELS[estimate.model], estimate.of_recording, calibrator.parameters, water)),
         **({} if card is None else card.values(calibrator, estimate, counts, now_s, rejected)),
     }
-    for number, each in enumerate(found, start=1):
-        values[f"finding {number}"] = str(each)
+    for number, reason in enumerate(found, start=1):
+        values[f"finding {number}"] = str(reason)
     status.values = [KeyValue(key=key, value=printable(str(value))) for key, value in values.items()]
     return status
 

@@ -57,7 +57,7 @@ class _Waiting:
         for waitable in self.waitables:
             waitable.add_to_wait_set(wait_set)
         wait_set.wait(timeout_ns)
-        inputs = [each for number, each in enumerate(self.inputs) if wait_set.is_ready("subscription", number)]
+        inputs = [entity for number, entity in enumerate(self.inputs) if wait_set.is_ready("subscription", number)]
         others = len(wait_set.get_ready_entities("subscription")) > len(inputs)
         others = others or any(wait_set.get_ready_entities(kind) for kind in ("timer", "client", "service"))
         if ready := wait_set.get_ready_entities("guard_condition"):

@@ -68,7 +68,7 @@ class RecentWorth:
         while self._looks[0][0] < now_s - STANDS_S:
             self._looks.popleft()
         predicted = PredictedDrift(
-            *(sorted(each)[len(each) // 2] for each in zip(*(d for _, d in self._looks), strict=True))
+            *(sorted(drifts)[len(drifts) // 2] for drifts in zip(*(d for _, d in self._looks), strict=True))
         )
         if self.is_good and predicted.both > WITHDRAWN_RATIO * target:
             self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=predicted.both)

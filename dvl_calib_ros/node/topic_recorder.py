@@ -38,7 +38,7 @@ class TopicRecorder:
     @property
     def topics(self) -> list[str]:
         """Recorded topics that are not static."""
-        return [each.topic_name for each in self._subscriptions if each.topic_name not in self._static]
+        return [heard.topic_name for heard in self._subscriptions if heard.topic_name not in self._static]
 
     def look(self) -> bool:
         """Subscribe to new topics. Return whether there are any."""

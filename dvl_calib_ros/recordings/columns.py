@@ -313,10 +313,10 @@ class Collector:
         self._bytes = int(end[-1])
         channel = np.full(len(data), self._channels.setdefault(part.channel, len(self._channels)))
         content = np.frombuffer(b"".join(data), dtype=np.uint8)
-        for column, each in zip(
+        for column, values in zip(
             self._singles.values(), (part.arrival, part.log_ns, channel, end, content), strict=True
         ):
-            column.add(each)
+            column.add(values)
 
     def columns(self) -> TopicColumns:
         """Return all messages."""

@@ -65,8 +65,8 @@ def stretches(
         dvl, reference, imu = (
             _block(
                 stream,
-                [decoded for each in cuts[stream] if len(decoded := each.decoded(index))],
-                [each.singles(index) for each in cuts[stream]],
+                [decoded for cut in cuts[stream] if len(decoded := cut.decoded(index))],
+                [cut.singles(index) for cut in cuts[stream]],
                 decoder,
             )
             for stream in (Stream.DVL, Stream.REFERENCE, Stream.IMU)
@@ -92,7 +92,7 @@ class _Cut:
     def newest_ns(self, index: int) -> int:
         """Return the log time of the last message up to the end of this stretch; 0 without any."""
         ends = (self._part.decoded, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
-        return max(int(each.log_ns[end - 1]) if end else 0 for each, end in ends)
+        return max(int(messages.log_ns[end - 1]) if end else 0 for messages, end in ends)
 
 
 def _block(

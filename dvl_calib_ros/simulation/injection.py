@@ -87,9 +87,9 @@ def disturbed(
     acts_on: ActsOn,
 ) -> Array:
     """Apply the effects on a sensor's noise, in order, to samples (N, 3) m/s at `motion.time`."""
-    for each, seed in injections:
-        if isinstance(each.effect, NoiseEffect) and each.effect.acts_on is acts_on:
-            velocity = each.effect.disturb(velocity, motion, each.values, np.random.default_rng(seed))
+    for injection, seed in injections:
+        if isinstance(injection.effect, NoiseEffect) and injection.effect.acts_on is acts_on:
+            velocity = injection.effect.disturb(velocity, motion, injection.values, np.random.default_rng(seed))
     return velocity
 
 

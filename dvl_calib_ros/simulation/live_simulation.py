@@ -59,9 +59,9 @@ class Follower:
         self._late_ns = start_ns - START_NS
         seeds = Seeds.of(scenario)
         self._disturbances = [
-            (each.effect, each.effect.following(each.values, np.random.default_rng(seed)))
-            for each, seed in zip(scenario.effects, seeds.effects, strict=True)
-            if isinstance(each.effect, NoiseEffect)
+            (injection.effect, injection.effect.following(injection.values, np.random.default_rng(seed)))
+            for injection, seed in zip(scenario.effects, seeds.effects, strict=True)
+            if isinstance(injection.effect, NoiseEffect)
         ]
         makers: tuple[Callable[..., Any], ...] = (dvl_at, gnss_at, imu_at)
         rates = (scenario.dvl_rate, scenario.gnss_rate, scenario.imu_rate)

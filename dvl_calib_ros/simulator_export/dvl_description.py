@@ -200,7 +200,7 @@ def _is_of_reference(name: str) -> bool:
 
 def _values(parameters: Mapping[str, Any]) -> dict[str, float]:
     """Return the values of a diagnosis' parameters; null means no limit."""
-    values = {name: each["value"] for name, each in parameters.items()}
+    values = {name: parameter["value"] for name, parameter in parameters.items()}
     return {name: math.inf if value is None else float(value) for name, value in values.items()}
 
 

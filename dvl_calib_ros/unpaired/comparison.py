@@ -131,8 +131,8 @@ def _differences(
 def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:
     """Return the log standard deviation (B,) of one axis in blocks of equal size."""
     levels = []
-    for each in scattered:
-        values = each.values[:, axis]
+    for recorded in scattered:
+        values = recorded.values[:, axis]
         blocks = values[: len(values) // BLOCK * BLOCK].reshape(-1, BLOCK)
         levels.append(np.log(np.maximum(np.median(np.abs(blocks), axis=1) / norm.ppf(0.75), 1e-9)))
     return np.concatenate(levels)

@@ -67,7 +67,7 @@ def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Se
     ]
     ladder = [SimulatedModel(AS_IT_IS, (), kept)]
     for effect in lacking:
-        others = {name: each for name, each in kept.items() if name != effect.name}
+        others = {name: effect_kept for name, effect_kept in kept.items() if name != effect.name}
         ladder.append(SimulatedModel(f"with {effect.name}", (effect,), others))
     if len(lacking) != 1 or set(vehicle) != set(lacking) or kept:
         ladder.append(SimulatedModel(ALL, tuple(vehicle), {}))

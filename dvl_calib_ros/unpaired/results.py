@@ -187,7 +187,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Lies):
         return _row(value)
     if isinstance(value, Mapping):
-        return {name: _plain(each) for name, each in value.items()}
+        return {name: _plain(item) for name, item in value.items()}
     if not isinstance(value, tuple):
         return value
     if len(value) != 3 or isinstance(value[0], str):

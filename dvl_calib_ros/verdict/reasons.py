@@ -74,8 +74,8 @@ class Reason:
     @property
     def _words(self) -> dict[str, Any]:
         return {
-            name: " and ".join(cause.sentence for cause in causes) if (causes := _causes(each)) else each
-            for name, each in self.numbers.items()
+            name: " and ".join(cause.sentence for cause in causes) if (causes := _causes(number)) else number
+            for name, number in self.numbers.items()
         }
 
     @property

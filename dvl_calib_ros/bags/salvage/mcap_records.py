@@ -281,7 +281,7 @@ def message_head(
         raise DamagedError(f"at byte {at}: a message is of no known channel")
     expected = tables.lengths.get(channel, length)
     if expected != length and tables.eras:  # a damaged length may lead into the message or past others
-        ends = [offset + RECORD_HEAD.size + each for each in (expected, length)]
+        ends = [offset + RECORD_HEAD.size + size for size in (expected, length)]
         by_usual, by_own = (likeness(holds(end), n - end, tables) for end in ends)
         if by_usual == ALIKE and (expected < length or by_own < ENOUGH_ALIKE):
             raise DamagedError(f"at byte {at}: the length of a message is damaged")

@@ -95,9 +95,7 @@ class Difference:
     def p(self) -> Array:
         """(8,) two-sided p-values with Holm's correction, nan if not compared."""
         found = np.full(N_COMPONENTS, np.nan)
-        found[self.compared] = holm(
-            [chi2_sf(each, 1) for each in ((self.value / self.std) ** 2)[self.compared].tolist()]
-        )
+        found[self.compared] = holm([chi2_sf(z2, 1) for z2 in ((self.value / self.std) ** 2)[self.compared].tolist()])
         return found
 
     def chance(self, components: NDArray[np.intp] = _ALL) -> float:
@@ -187,7 +185,7 @@ class Comparison(Answering):
     def contradicting(self) -> tuple[Change, ...]:
         """Changes of the mounting at 1 %, across which an average would be no calibration's mounting."""
         level = CHANCE / (len(self.calibrations) - 1)
-        return tuple(each for each in (*self.moved, *self.suspicious) if each.difference.chance(MOUNTING) < level)
+        return tuple(move for move in (*self.moved, *self.suspicious) if move.difference.chance(MOUNTING) < level)
 
     @property
     def same_mounting(self) -> bool:
@@ -204,7 +202,7 @@ def contradicts(result: Extrinsics, initial: Extrinsics) -> Difference | None:
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
     """Raise InputError for a calibration that is given twice: its differences would be zero."""
     for one, other in combinations(calibrations, 2):
-        identity, other_identity = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
+        identity, other_identity = ((c.model, c.first_ns, c.last_ns, c.used) for c in (one, other))
         if identity == other_identity and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
             raise InputError(
                 f"{one.name}, {other.name}: are the same calibration, which cannot be compared with itself"
@@ -326,11 +324,11 @@ def _changes(
 def _suspected(series: Sequence[Extrinsics], rejected: Sequence[Extrinsics]) -> list[Change]:
     """Compare each rejected calibration with the accepted one nearest in stamps."""
     found = []
-    for each in rejected:
-        nearest = min(series, key=lambda other: abs(other.first_ns - each.first_ns))
-        first, second = sorted((nearest, each), key=lambda calibration: calibration.first_ns)
+    for doubted in rejected:
+        nearest = min(series, key=lambda other: abs(other.first_ns - doubted.first_ns))
+        first, second = sorted((nearest, doubted), key=lambda calibration: calibration.first_ns)
         found.append(Change(Difference.between(first, second), first, second))
-    return [each for each in found if each.difference.chance(MOUNTING) < SUSPICIOUS / len(rejected)]
+    return [move for move in found if move.difference.chance(MOUNTING) < SUSPICIOUS / len(rejected)]
 
 
 def _smallest(differences: Sequence[Difference]) -> Array:
@@ -345,10 +343,10 @@ def _smallest(differences: Sequence[Difference]) -> Array:
 def _scatter(series: Sequence[Extrinsics], starts: Sequence[Extrinsics], together: _Together) -> ChiSquare:
     """Test the mountings about the mean of each stretch that begins at one of `starts`."""
     total, freedom, begin = 0.0, 0, 0
-    for k, each in enumerate(series):
-        begin = k if each in starts else begin
+    for k, calibration in enumerate(series):
+        begin = k if calibration in starts else begin
         if k > begin:  # each against those before it: independent terms, the same sum
-            test = Difference.between(together(tuple(series[begin:k])), each).chi_square(MOUNTING)
+            test = Difference.between(together(tuple(series[begin:k])), calibration).chi_square(MOUNTING)
             total, freedom = total + test.value, freedom + test.freedom
     return ChiSquare(total, freedom, chi2_sf(total, freedom) if freedom else math.nan)
 
@@ -382,8 +380,8 @@ def _same(comparison: Comparison) -> Reason:
         numbers = {"chi_square": scatter.value, "freedom": scatter.freedom, "p": scatter.p}
         return finding("MOUNTING_SCATTERS", count=len(comparison.calibrations), apart=math.degrees(change), **numbers)
     smallest = np.degrees(comparison.smallest)
-    found = [f"{name} {each:.1f}°" for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(each)]
-    not_compared = [name for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(each)]
+    found = [f"{name} {size:.1f}°" for name, size in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(size)]
+    not_compared = [name for name, size in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(size)]
     return finding(
         "MOUNTING_SAME",
         smallest=float(np.nanmax(smallest, initial=0.0)),
@@ -415,7 +413,7 @@ def suspected(change: Change) -> Reason:
 
 def scale_changed(change: Change) -> Reason:
     """Word a change of scale."""
-    percent, std = (100.0 * float(each[SCALE]) for each in (change.difference.value, change.difference.std))
+    percent, std = (100.0 * float(part[SCALE]) for part in (change.difference.value, change.difference.std))
     return finding("SCALE_CHANGED", percent=percent, std=std, between=between(change))
 
 

@@ -259,11 +259,11 @@ class Remembered(NamedTuple):
 
 def states_in_effect(remembered: Sequence[Remembered], stamps_ns: Stamps) -> PastStates:
     """Return the states in effect at stamps (E,). remembered: in order; the first one is from the beginning on."""
-    at = np.searchsorted([each.from_ns for each in remembered], stamps_ns, side="right") - 1
+    at = np.searchsorted([past.from_ns for past in remembered], stamps_ns, side="right") - 1
     in_effect = [remembered[index] for index in at.tolist()]
-    x, p = np.array([each.state.x for each in in_effect]), np.array([each.state.p for each in in_effect])
-    used = np.array([each.used for each in in_effect], dtype=np.int64)
-    return PastStates(GaussianState(x, p), used, np.array([each.nis_sum for each in in_effect]))
+    x, p = np.array([past.state.x for past in in_effect]), np.array([past.state.p for past in in_effect])
+    used = np.array([past.used for past in in_effect], dtype=np.int64)
+    return PastStates(GaussianState(x, p), used, np.array([past.nis_sum for past in in_effect]))
 
 
 class LinearEstimator(Estimator):

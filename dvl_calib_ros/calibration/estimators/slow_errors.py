@@ -84,7 +84,7 @@ def normal_points(k: int, n: int) -> Array:
         root = (1.0 + root) ** (1.0 / (k + 1))
     uniform = (0.5 + np.arange(n)[:, None] * (1.0 / root) ** np.arange(1, k + 1)) % 1.0
     normal = NormalDist()
-    return np.array([normal.inv_cdf(each) for each in uniform.ravel().tolist()]).reshape(n, k)
+    return np.array([normal.inv_cdf(share) for share in uniform.ravel().tolist()]).reshape(n, k)
 
 
 class Bins(NamedTuple):

@@ -384,6 +384,6 @@ def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array]]:
         return
     except np.linalg.LinAlgError:
         pass  # one is singular: invert each alone
-    for each in zip(x, p, strict=True):
+    for state in zip(x, p, strict=True):
         with suppress(np.linalg.LinAlgError):
-            yield GaussianState(*each).information
+            yield GaussianState(*state).information

@@ -42,7 +42,7 @@ class Assembler:
         self._starts = [given.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
         self._floors = [_floor(model, parameters) for model in self.models]
         held = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
-        self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
+        self.start = GaussianState(np.array([state.x for state in held]), np.array([state.p for state in held]))
         # gate by the number of unmeasured axes
         self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m + 1)])
         self._gate = np.full((len(self.models), 1), self._gates[0])

@@ -123,7 +123,7 @@ class Model:
         return self._nuisance_that(lambda each: not each.handed_on)
 
     def _nuisance_that(self, is_so: Callable[[Nuisance], bool]) -> NDArray[np.intp]:
-        return np.array([self.n_errors + i for i, each in enumerate(self.nuisance) if is_so(each)], dtype=np.intp)
+        return np.array([self.n_errors + i for i, spec in enumerate(self.nuisance) if is_so(spec)], dtype=np.intp)
 
     @cached_property
     def error_terms_from_state(self) -> Array:

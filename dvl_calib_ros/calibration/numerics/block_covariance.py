@@ -74,8 +74,8 @@ class TimeBlocks:
             self._vector = np.full((MAX_BLOCKS, *vector.shape), np.nan)
         if self.count == MAX_BLOCKS:
             self.count = MAX_BLOCKS // 2
-            for each in (self._information, self._vector):
-                each[: self.count] = each[0::2] + each[1::2]
+            for sums in (self._information, self._vector):
+                sums[: self.count] = sums[0::2] + sums[1::2]
             self._each *= 2
         self._information[self.count], self._vector[self.count] = information, vector
         self.count += 1
@@ -113,7 +113,7 @@ class TimeBlocks:
         """Return the blocks of one of the K."""
         if not self.count:
             return BlocksOfOne(np.zeros((0, 0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
-        information, vector = (each[:, index].copy() for each in self.kept)
+        information, vector = (sums[:, index].copy() for sums in self.kept)
         return BlocksOfOne(information, vector, self.total[0][index])
 
     def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTING_Z, rarely: float | None = RARE) -> Array:
@@ -147,8 +147,8 @@ def inflations(
     for count in sorted(set(counts[counts >= MIN_BLOCKS].tolist())):
         chosen = np.flatnonzero(counts == count)
         own = [(blocks[number], x[number]) for number in chosen.tolist()]
-        scores = np.stack([each.vector - each.information @ estimate for each, estimate in own])
-        information = np.stack([each.information for each, _ in own])
+        scores = np.stack([blocks.vector - blocks.information @ estimate for blocks, estimate in own])
+        information = np.stack([blocks.information for blocks, _ in own])
         # share of each block in the claimed variance of each quantity (S, m, r)
         shares = np.einsum("srn,smnk,srk->smr", p[chosen], information, p[chosen], optimize=True)
         factor[chosen] = _inflations(scores, shares, p[chosen], variance[chosen], lasts, rarely)
@@ -173,7 +173,7 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
         # the prior part of P is not judged by the data
         ratio = 1.0 + excess / np.maximum(variance, 1e-300)
         factor = np.maximum(factor, np.where(observed > by_chance, np.sqrt(np.maximum(ratio, 1.0)), 1.0))
-        scores, parts = (_paired(each) for each in (scores, parts))
+        scores, parts = (_paired(values) for values in (scores, parts))
     return factor
 
 

@@ -125,10 +125,10 @@ class Updated:
     def joined(models: Sequence[Updated]) -> Updated:
         """Return the joined updates of models, each with K = 1."""
         x, p, used, nis = (
-            np.concatenate(each) for each in zip(*((m.x, m.p, m.used, m.nis) for m in models), strict=True)
+            np.concatenate(parts) for parts in zip(*((m.x, m.p, m.used, m.nis) for m in models), strict=True)
         )
         found = [model.at for model in models if model.at is not None]
-        at = GaussianState(*(np.concatenate(each, axis=1) for each in zip(*found, strict=True))) if found else None
+        at = GaussianState(*(np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))) if found else None
         return Updated(x, p, used, nis, at)
 
 
@@ -169,8 +169,8 @@ def _recursion_of_one(
     n_samples, n = data.z.shape[1], len(x)
     identity = _identity(n)
     z, h_all = data.z[k], data.h[k]
-    r, gate, weight = (each[k] if len(each) > 1 else each[0] for each in (data.r, data.gate, data.weight))
-    r, gate = (each if len(each) == n_samples else [each[0]] * n_samples for each in (r, gate.tolist()))
+    r, gate, weight = (values[k] if len(values) > 1 else values[0] for values in (data.r, data.gate, data.weight))
+    r, gate = (values if len(values) == n_samples else [values[0]] * n_samples for values in (r, gate.tolist()))
     usable, weight = data.usable[k].tolist(), weight.tolist()
     used, nis = [], []
     path = [GaussianState(x, p)]
@@ -356,7 +356,7 @@ def _solve(x: Array, p: Array, data: Measurements, measured: NDArray[np.intp]) -
 
 def _passes_before(x: Array, prior: Array, prior_state: Array, h: Array, z: Array, gate: Array) -> Mask:
     """Return which samples (K, N) pass the gate of the initial x (K, n), Λ (K, n, n), Λx (K, n)."""
-    innovation = [each - _dot(row, x.T[..., None]) for row, each in zip(h, z, strict=True)]
+    innovation = [measured - _dot(row, x.T[..., None]) for row, measured in zip(h, z, strict=True)]
     passes = _dot(innovation, innovation) <= gate
     # S >= R, so only samples that fail with R alone may fail
     k, at = np.nonzero(~passes)
@@ -466,7 +466,7 @@ def _normalised_innovation_squared(
     s = [[_dot(u[i], u[j]) for j in range(i + 1)] for i in range(len(u))]
     for i, row in enumerate(s):
         row[i] += 1.0
-    innovation = [each - _dot(u[row], y) for row, each in enumerate(z)]
+    innovation = [measured - _dot(u[row], y) for row, measured in enumerate(z)]
     return distance_squared(s, innovation)
 
 

@@ -196,13 +196,13 @@ class SampleBlock:
 
     def joined(self, *others: SampleBlock) -> SampleBlock:
         """Return these rows followed by those of others of the stream; each call copies all rows."""
-        reasons = tuple(dict.fromkeys(reason for each in (self, *others) for reason in each.reasons))
+        reasons = tuple(dict.fromkeys(reason for block in (self, *others) for reason in block.reasons))
         refused = []
-        for each in (self, *others):
-            code = np.array([0, *(1 + reasons.index(reason) for reason in each.reasons)], dtype=np.uint8)
-            refused.append(code[each.refused])
+        for block in (self, *others):
+            code = np.array([0, *(1 + reasons.index(reason) for reason in block.reasons)], dtype=np.uint8)
+            refused.append(code[block.refused])
         stamps_ns, values, arrival, frames = (
-            np.concatenate([getattr(each, name) for each in (self, *others)])
+            np.concatenate([getattr(block, name) for block in (self, *others)])
             for name in ("stamps_ns", "values", "arrival", "frames")
         )
         covariances = self.covariances.joined(*(other.covariances for other in others))
@@ -282,8 +282,8 @@ class Streams(NamedTuple):
         middle = np.sort(np.concatenate([block.arrival for block in self]))[sum(map(len, self)) // 2]
         at = [int(np.searchsorted(block.arrival, middle)) for block in self]
         return (
-            Streams(*(each.part(slice(end)) for each, end in zip(self, at, strict=True))),
-            Streams(*(each.part(slice(first, None)) for each, first in zip(self, at, strict=True))),
+            Streams(*(block.part(slice(end)) for block, end in zip(self, at, strict=True))),
+            Streams(*(block.part(slice(first, None)) for block, first in zip(self, at, strict=True))),
         )
 
     def arriving_by_stamp(self) -> Streams:

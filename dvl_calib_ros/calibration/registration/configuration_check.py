@@ -67,7 +67,7 @@ class Directions:
 
         NED needs several headings: a vehicle that yaws in waves on a straight course looks like NED.
         """
-        spread_body, spread_enu, spread_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
+        spread_body, spread_enu, spread_ned = (1.0 - self._length(mean) for mean in (self._body, self._enu, self._ned))
         max_spread = 1.0 - RESULTANT_LIMIT
         if spread_enu < max_spread and spread_enu < MAX_SPREAD_RATIO * spread_body:
             return True

@@ -282,7 +282,7 @@ def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: 
     """
     candidates = candidate_delays(motion, rotation)
     max_misfit = MISFIT_LIMIT[0] * candidates[0].misfit + MISFIT_LIMIT[1] if candidates else 0.0
-    delays = [(each.reference, each.dvl - each.reference) for each in candidates if each.misfit <= max_misfit]
+    delays = [(pair.reference, pair.dvl - pair.reference) for pair in candidates if pair.misfit <= max_misfit]
     fits = [quick(rho, delta, rotation) for rho, delta in {*delays, (0.0, 0.0)}]
     possible = [fit for fit in fits if fit is not None and _is_possible(fit)]
     if not possible:

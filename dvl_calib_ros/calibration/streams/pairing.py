@@ -194,7 +194,7 @@ class Rows(RowTable):
         return AlignedBlock(*[getattr(self, name)[at] for name in _COLUMNS])
 
 
-_COLUMNS = [each.name for each in fields(AlignedBlock)]
+_COLUMNS = [column.name for column in fields(AlignedBlock)]
 
 
 class Gates:
