@@ -145,7 +145,7 @@ class Calibrator:
         }
         for name in self._models:
             if MODELS[name].estimator:
-                self._estimators[name] = self._made(MODELS[name])
+                self._estimators[name] = self._new_estimator(MODELS[name])
         # estimators beyond the linear filter
         self._further = NonlinearEstimators([self._estimators[name] for name in self._models if MODELS[name].estimator])
         self._estimates = Estimates(self._estimators, self._further, self._models, self.parameters)
@@ -155,7 +155,7 @@ class Calibrator:
         if self._trace is not None:
             self._trace.start(self._groups)
 
-    def _made(self, model: Model) -> Estimator:
+    def _new_estimator(self, model: Model) -> Estimator:
         """Make the estimator that a model names."""
         together = 1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK)
         setup = EstimatorSetup(

@@ -332,7 +332,7 @@ class _Search:
             self._contradictions.append(finding("DVL_FRAME_NOT_OWN", topic=dvl.topic, frame=dvl.frame_id))
         placed = self._tree.placed(frame, base_frame)
         if placed is None and not self._is_body_or_earth(frame):
-            likely_frame = self._tree.likely(topic_choice.DVL_WORDS)
+            likely_frame = self._tree.only_named_like(topic_choice.DVL_WORDS)
             placed = None if likely_frame is None else self._tree.placed(likely_frame, base_frame)
             if placed is not None:
                 self._notes.append(finding("FRAME_NOT_IN_TREE", frame=frame, other=placed.frame))

@@ -104,7 +104,7 @@ class FrameTree:
         same = [other for other in known if last and _last_part(other) == last]
         return same[0] if len(same) == 1 else None
 
-    def base(self, frame: str, wanted: str) -> str | None:
+    def body_above(self, frame: str, wanted: str) -> str | None:
         """Return the body frame above a frame; None if there is none.
 
         This is the frame named `wanted`, in any namespace, else the highest one that is no earth frame.
@@ -125,7 +125,7 @@ class FrameTree:
         frame = self.named(frame_id)
         if frame is None:
             return None
-        base = self.base(frame, base_frame)
+        base = self.body_above(frame, base_frame)
         if base is None:
             return Placed(frame, frame, np.eye(3), np.zeros(3), "") if _same(frame, base_frame) else None
         rotation, position, sources = np.eye(3), np.zeros(3), []
@@ -138,7 +138,7 @@ class FrameTree:
         source = " and ".join(dict.fromkeys(sources))
         return Placed(base, frame, rotation, position if is_located else np.zeros(3), source, is_located)
 
-    def likely(self, words: Iterable[str]) -> str | None:
+    def only_named_like(self, words: Iterable[str]) -> str | None:
         """Return the only frame whose name has one of these words, for a frame_id that is not in the tree."""
         found = [frame for frame in sorted(self._parents) if any(word in frame.lower() for word in words)]
         return found[0] if len(found) == 1 else None

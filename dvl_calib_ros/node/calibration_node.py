@@ -469,7 +469,7 @@ class CalibrationNode(AnsweringNode):
     def _read_water(self) -> None:
         subscribed = [subscription.topic_name for subscription in self._inputs.values()]
         dvl = (self._inputs["dvl/twist"].topic_name, self._feed.decoder.dvl_type.name, self._newest_dvl)
-        self._water, self._newest_dvl = self._water_heard.hear(subscribed, dvl), None
+        self._water, self._newest_dvl = self._water_heard.update(subscribed, dvl), None
 
     def _topic_problems(self) -> list[Reason]:
         """Return the problems with publishers and subscribers of all topics."""

@@ -49,7 +49,7 @@ class RecentWorth:
         self.is_good = False
         self.taken_back: Reason | None = None
 
-    def look(self, model: str, drift: PredictedDrift, target: float, now_s: float, rejected: bool) -> PredictedDrift:
+    def add(self, model: str, drift: PredictedDrift, target: float, now_s: float, rejected: bool) -> PredictedDrift:
         """Add a prediction and return the displayed drift, the median of the recent ones.
 
         now_s: time by DVL stamps. rejected: whether a replay would reject the calibration.
@@ -185,7 +185,7 @@ class Card:
                 self._driven_s[SECTORS[sector]] += step
         target, worth = parameters.target_drift, self._worth
         predicted = predicted_drift(model, estimate.velocity_covariance, parameters)
-        drift = worth.look(model.name, predicted, target, self._shown_s, rejected)
+        drift = worth.add(model.name, predicted, target, self._shown_s, rejected)
         if rejected:
             plan = Outlook(finding("NEXT_REJECTED"), None)
         elif worth.is_good:

@@ -257,7 +257,7 @@ class _PreviewRows:
             messages = _differences(messages, self._kind.position, self._window_s)
         for arrival, log_ns, message in messages:
             with suppress(*UNREADABLE):
-                values, extra = self._of(message)
+                values, extra = self._values_of(message)
                 row = np.array([[arrival], [log_ns], [stamped(message, log_ns)]])
                 name = frame_name(str(message.header.frame_id if self._kind is None else self._kind.frame_id(message)))
                 self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), extra))
@@ -265,7 +265,7 @@ class _PreviewRows:
                 self._variances.append(np.array([self._claimed_variance(message)]))
                 self.world = self.world or frame_name(str(message.header.frame_id))
 
-    def _of(self, message: Any) -> tuple[list[float], Array]:
+    def _values_of(self, message: Any) -> tuple[list[float], Array]:
         """Return a velocity, or an IMU's quaternion and angular velocity; and the additional values."""
         if self._kind is not None:
             v = message.velocity if self._kind.position else self._kind.velocity(message)

@@ -32,7 +32,7 @@ from .effect_comparison import (
     compared_names,
     fitted,
     is_there,
-    lies,
+    location_of,
     p_alike,
     sizes,
     smallest_difference,
@@ -439,7 +439,7 @@ class _Compared:
         side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not is_present[0] else 0
         trace = trace_of(self._selections[side], self._fits[side], self.sizes[name][side].effect)
         adds = float(np.sqrt((trace**2).sum(axis=1).mean()))
-        where = lies(self._selections[side], self._fits[side], trace)
+        where = location_of(self._selections[side], self._fits[side], trace)
         return ComparedEffect(
             name, status, self._equivalent(name), vehicle.intervals(), simulator.intervals(), p, adds, where, needs
         )

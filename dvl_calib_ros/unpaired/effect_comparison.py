@@ -204,7 +204,7 @@ def trace_of(selection: EffectSelection, fit: Fit, effect: Effect) -> Array:
     return without.residual - fit.residual
 
 
-def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
+def location_of(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
     """Return the axis, regime of motion and frequency band with most energy of a trace (M, A) m/s.
 
     A regime is named by its energy per time, compared with the whole run.

@@ -46,8 +46,8 @@ CONFIGURATIONS = on_page(
         "the DVL's y points the other way: in turns the speed ahead shows {slope:.1f} ± {std:.1f} times the current "
         "that y shows",
         means=(
-            "Left-handed axes of the DVL, forward-right-down for forward-left-up, or a heading that counts the other "
-            "way."
+            "The DVL's axes are left-handed, or forward-right-down for forward-left-up, or the heading counts the "
+            "other way."
         ),
         remedy="negate y in the DVL's driver; if z points the other way as well, set dvl_axes to {axes}",
     ),
@@ -62,7 +62,7 @@ CONFIGURATIONS = on_page(
     reject(
         "DVL_AXIS_SCALED",
         "the DVL's {axis} is {factor:.2g} times its true value, and its {other} is not",
-        means="Wrong beam angles or beam matrix.",
+        means="The beam angles or the beam matrix in the driver are wrong.",
         remedy="check the beam angle and the beam order in the DVL's driver",
     ),
     reject(
@@ -134,7 +134,7 @@ CONFIGURATIONS = on_page(
     reject(
         "RATES_TURNED",
         "an angular velocity whose axes are rotated by {degrees:.0f}° from the attitude's",
-        means="Two instruments in one message, or one is corrected for its mounting alone.",
+        means="Two instruments share one message, or only one of them is corrected for its mounting.",
     ),
     # gravity; alone it rejects no calibration, as no calibration uses the acceleration
     accept(
@@ -242,7 +242,7 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_SIDEWAYS",
         "with the mounting {given} the vehicle travels sideways; it goes ahead with {found}",
-        means="A yaw or an axis of the wrong sign, or a vehicle that drifts.",
+        means="A yaw or an axis has the wrong sign, or the vehicle drifts.",
         remedy="try -p mounting_rpy:={option}{also}",
     ),
     reject(

@@ -107,19 +107,19 @@ FINDINGS = (
     warning(
         "STAMP_REPEATED",
         "{count} {stream} samples repeat the stamp of the one before; they are not used",
-        means="Two publishers on one topic, or a driver that sends twice.",
+        means="There are two publishers on one topic, or the driver sends twice.",
         remedy="stop the second publisher (ros2 topic info -v)",
     ),
     warning(
         "STAMP_OUT_OF_ORDER",
         "{count} {stream} samples are older than the one before; they are not used",
-        means="Two publishers on one topic, or a clock set back by less than `max_time_jump`.",
+        means="There are two publishers on one topic, or a clock was set back by less than `max_time_jump`.",
         remedy="stop the second publisher (ros2 topic info -v), set clocks before the run",
     ),
     warning(
         "TOPIC_SEVERAL_PUBLISHERS",
         "{topic}: {count} publishers ({names}), where one is expected",
-        means="Two drivers, or a bag next to the driver: samples mix.",
+        means="Two drivers run, or a bag is played next to the driver: their samples mix.",
         remedy="stop the others",
     ),
     warning(
@@ -142,13 +142,13 @@ FINDINGS = (
     warning(
         "SECOND_NODE",
         "{topic}: {count} publishers ({names})",
-        means="Two calibration nodes, or a bag with recorded estimates.",
+        means="Two calibration nodes run, or a bag with recorded estimates is played.",
         remedy="stop the second node, or give one a namespace (--ros-args -r __ns:=/port) and its own result_file",
     ),
     warning(
         "TF_TWICE",
         "another node publishes a transform to {frame!r}, in addition to publish_tf",
-        means="Usually robot_state_publisher with the nominal mounting.",
+        means="Usually it is robot_state_publisher, with the nominal mounting.",
         remedy="turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
     ),
     warning(
@@ -253,7 +253,7 @@ FINDINGS = (
     warning(
         "GNSS_LOSSES",
         "GNSS was lost {count} times",
-        means="Antenna under water or shaded.",
+        means="The antenna was under water or shaded.",
         remedy="check its antenna; if models switch to and fro, raise gnss_hysteresis",
     ),
     warning(
@@ -337,14 +337,14 @@ FINDINGS = (
         "DVL_BIAS",
         "the DVL has the same velocity error at every speed, {axes} mm/s in the body, which "
         "looks like {degrees:.1f}° of misalignment at the usual speed",
-        means="A bias of the DVL's electronics, a rounding, or water that moves in its shell.",
+        means="The cause is a bias of the electronics, a rounding, or water that moves in the DVL's shell.",
         remedy="subtract the bias in the driver, or have the DVL serviced",
     ),
     warning(
         "BEAM_OFF",
         "one beam of the DVL is off by {percent:.0f} ± {std:.0f} %: the beam {azimuth:.0f}° to port of its x axis "
         "reads low, or the opposite beam high",
-        means="A fouled or damaged transducer, or bubbles before it; roll and yaw of the mounting are then wrong.",
+        means="A transducer is fouled, damaged or behind bubbles. Roll and yaw of the mounting are then wrong.",
         remedy="look at that transducer; a DVL that gives beam velocities can solve without it",
     ),
     warning(
@@ -368,7 +368,7 @@ FINDINGS = (
     warning(
         "LEVER_ARM_CONTRADICTED",
         "the lever arm in the data differs from the configured one: {axes}",
-        means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
+        means="The position is wrong, or the IMU's heading, turn rate or clock. The configured arm is kept.",
         remedy=(
             "measure the positions of DVL and reference point (lever_arm, reference_position), then check the IMU's "
             "axes and clock"
@@ -458,7 +458,7 @@ DOCTOR = on_page(
     warning(
         "DOCTOR_REPEATED_STAMP",
         "{topic}: {share:.0%} of the stamps repeat the one before",
-        means="Two publishers, or a driver that sends twice.",
+        means="There are two publishers, or the driver sends twice.",
         remedy="stop the second publisher (ros2 topic info -v {topic})",
     ),
     error(
@@ -533,7 +533,7 @@ DOCTOR = on_page(
     error(
         "DOCTOR_DISAGREE",
         "DVL and reference do not agree in any frames: {left:.0%} of the speed stays unexplained",
-        means="A wrong heading, clocks that differ by seconds, another vehicle's data, or water track.",
+        means="The heading is wrong, clocks differ by seconds, or the data are another vehicle's or in water track.",
         remedy="check the IMU's heading (yaw 0 is east and counts to the left), the stamps, and the DVL's bottom lock",
     ),
     warning("DOCTOR_FRAMES", "{says}", remedy="check frames and transforms"),

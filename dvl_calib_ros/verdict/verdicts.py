@@ -117,7 +117,7 @@ VERDICTS = on_page(
     reject(
         "BAGS_OVERLAP",
         "{first} and {second} hold the DVL at the same time, so of samples at one time only the first is used",
-        means="One recording twice, or two DVLs.",
+        means="One recording is given twice, or there are two DVLs.",
         remedy="replay each by itself, and compare them",
     ),
     reject(
@@ -296,7 +296,7 @@ DIAGNOSES = on_page(
     marginal(
         "GAP_TOO_SHORT",
         "no gap can be measured in this recording: {samples} samples over {seconds:.0f} s are too few",
-        means="Samples with DVL, reference and attitude count.",
+        means="Only samples with DVL, reference and attitude count.",
         remedy="record {wanted:.0f} s at least, better 600 s",
     ),
     marginal(

@@ -359,7 +359,7 @@ _ANGLE_NAMES = COMPONENTS[ANGLES]
 def reasons(comparison: Comparison) -> list[Reason]:
     """Return the findings, the mounting first."""
     findings = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
-    findings = [*findings, *map(suspected, comparison.suspected)] or [_same(comparison)]
+    findings = [*findings, *map(suspected, comparison.suspected)] or [_no_movement(comparison)]
     findings += map(scale_changed, comparison.scale_changed)
     for change in comparison.clock_changed:
         seconds, std = float(change.difference.value[TIME_OFFSET]), float(change.difference.std[TIME_OFFSET])
@@ -372,7 +372,7 @@ def reasons(comparison: Comparison) -> list[Reason]:
     return findings
 
 
-def _same(comparison: Comparison) -> Reason:
+def _no_movement(comparison: Comparison) -> Reason:
     """Return the smallest movement that would be found, or that no single date explains the differences."""
     scatter = comparison.scatter
     if scatter.freedom and scatter.p < CHANCE:

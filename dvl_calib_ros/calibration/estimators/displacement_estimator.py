@@ -125,12 +125,12 @@ class Displacements(Estimator):
         """See `Estimator`."""
         self.take_rows()
         while self._first_ns is not None and self._next_ns <= self._oriented_ns:
-            self._look(self._next_ns)
+            self._solve_complete_legs(self._next_ns)
             passed_s = 1e-9 * (self._next_ns - self._first_ns)
             self._next_ns = self._first_ns + round(1e9 * math.ceil(passed_s * GROWTH))
         self._let_take_effect(self._oriented_ns)
 
-    def _look(self, at_ns: int) -> None:
+    def _solve_complete_legs(self, at_ns: int) -> None:
         """Solve the legs that are complete at a stamp, whatever has arrived since."""
         assert self._first_ns is not None
         legs = self._reckoning.legs()

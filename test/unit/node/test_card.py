@@ -179,9 +179,9 @@ def test_a_sigma_that_has_grown_for_good_takes_good_enough_back_and_says_so_unti
 def test_another_model_takes_good_enough_back_at_once_and_is_named():
     worth, drift = RecentWorth(), PredictedDrift(1.0, 1.0, 1.4)
     for second in range(40):
-        worth.look("full", drift, 2.0, float(second), rejected=False)
+        worth.add("full", drift, 2.0, float(second), rejected=False)
     assert worth.is_good and worth.taken_back is None
-    worth.look("unaided", drift, 2.0, 40.0, rejected=False)
+    worth.add("unaided", drift, 2.0, 40.0, rejected=False)
     assert not worth.is_good and "unaided" in worth.taken_back.sentence and worth.seconds_left(41.0) == STANDS_S - 1.0
 
 
