@@ -140,17 +140,17 @@ class Recorder:
         self._paired = Thinned(KEPT_VELOCITIES, self._expected)
 
     def take(self, block: AlignedBlock) -> None:
-        """Add rows."""
+        """Add aligned rows: stamps and pairing of all, DVL and reference velocities of the usable and paired ones."""
         self._stamps_ns.append(block.stamps_ns)
         self._pairing.append(block.pairing)
         usable, paired = block.part(block.usable), block.part(block.paired)
         if len(usable):
-            seen = self._observer.observe(usable, Needs.NOTHING, np.zeros(2))
-            self._dvl.add(usable.stamps_ns, seen.velocity_at_reference)
+            observed = self._observer.observe(usable, Needs.NOTHING, np.zeros(2))
+            self._dvl.add(usable.stamps_ns, observed.velocity_at_reference)
         if len(paired):
-            seen = self._observer.observe(paired, Needs.REFERENCE, np.zeros(2))
-            assert seen.reference_body is not None
-            self._paired.add(paired.stamps_ns, seen.reference_body)
+            observed = self._observer.observe(paired, Needs.REFERENCE, np.zeros(2))
+            assert observed.reference_body is not None
+            self._paired.add(paired.stamps_ns, observed.reference_body)
 
     def history(self, calibrator: Calibrator, estimates: Mapping[str, Estimate]) -> RunHistory:
         """Return the history after `Calibrator.finish`, ending with the estimates of its result."""

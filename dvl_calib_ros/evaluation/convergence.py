@@ -92,7 +92,7 @@ def curves(models: Sequence[str], squares: Array) -> tuple[ConvergenceCurve, ...
 
 
 def curves_document(found: Sequence[ConvergenceCurve]) -> dict[str, Any]:
-    """Return plain data, degrees."""
+    """Return the curves as plain data for JSON, in degrees."""
     return {
         "times_s": list(TIMES_S),
         "published": {"seconds": PUBLISHED_S, "degrees": PUBLISHED_DEG},

@@ -56,7 +56,7 @@ class Improvement(NamedTuple):
         if not self.model:
             return f"Nothing could be calibrated and checked on other {what}."
         error = f"{self.model} leaves a velocity error of {self.after:.3f} m/s rms"
-        return f"On {what} that were not calibrated on {error}; without a calibration, {self.before:.3f}."
+        return f"On the other {what}, {error}; without a calibration, {self.before:.3f}."
 
 
 @dataclass(frozen=True)

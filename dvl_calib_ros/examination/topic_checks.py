@@ -119,7 +119,7 @@ def apart_findings(dvl: Recorded, reference: Recorded) -> list[Reason]:
 
 
 def gap_findings(topic: Recorded) -> list[Reason]:
-    """Report gaps, by log time."""
+    """Report the gaps between the log times of a topic: their total length, number, and the longest."""
     if len(topic) < ENOUGH:
         return []
     steps = np.diff(topic.log_ns) * 1e-9

@@ -378,12 +378,12 @@ def cross_check(check: CrossCheck) -> Document:
                 where=Where.PAGE,
             ),
             section(
-                "Dead reckoning on bags that were not calibrated on",
+                "Dead reckoning on the other bags",
                 Table(heading, drift_rows if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
                 *pictures,
             ),
             section(
-                "Difference of DVL and GNSS on bags that were not calibrated on",
+                "Difference of DVL and GNSS on the other bags",
                 Table(heading, errors, dense=True, notes=(ERRORS_NOTE,), words=2),
             ),
             section("", *(Sentence(each, soft=True) for each in check.found)),

@@ -319,7 +319,7 @@ class Collector:
             column.add(values)
 
     def columns(self) -> TopicColumns:
-        """Return all messages."""
+        """Return all collected messages, each part in order of arrival."""
         decoded = DecodedRows(
             **{name: column.array() for name, column in self._laid.items()},
             world=self._world,

@@ -236,7 +236,7 @@ def open_recording(
 
 
 def together(recordings: Sequence[Recording]) -> Recording:
-    """Join several recordings."""
+    """Join several recordings to one; their arrivals are renumbered by log time."""
     if len(recordings) == 1:
         return recordings[0]
     counts: Counter[str] = Counter()

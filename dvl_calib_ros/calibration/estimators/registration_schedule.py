@@ -197,7 +197,7 @@ class RegistrationSchedule:
         return None if registered.registration is None else registered.registration.contradiction(self._parameters)
 
     def _register(self, fit_so_far: FitSoFar | None) -> RegistrationResult:
-        """Register the kept blocks."""
+        """Register clocks and frames from the newest blocks, and compute live residuals of the fit so far."""
         motion = self._newest.motion() if len(self._newest) >= MIN_BLOCKS else None
         if motion is None:
             return RegistrationResult(self._blocks)

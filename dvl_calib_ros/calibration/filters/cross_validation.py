@@ -174,7 +174,7 @@ class Moments(FoldSums):
         return MomentSums(*(self.total if fold is None else self.of(fold)))
 
     def take(self, folds: NDArray[np.int64], observations: Observations) -> None:
-        """Add N samples."""
+        """Add N samples to the sums of their folds. folds: (N,) fold of each."""
         assert observations.reference_body is not None
         v, g = observations.velocity_at_reference, observations.reference_body
         measured = np.broadcast_to(observations.measured_in_body, v.shape)

@@ -411,7 +411,7 @@ def _cholesky(a: Elements) -> tuple[list[list[Array]], list[Array]]:
 
 
 def _invert_lower(low: Elements, inverse_diagonal: Sequence[Array]) -> list[list[Array]]:
-    """Return L⁻¹."""
+    """Return the inverse of lower triangular matrices L, row by row."""
     n = len(low)
     inverse: list[list[Array]] = []
     for i in range(n):

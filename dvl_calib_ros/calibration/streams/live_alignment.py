@@ -90,7 +90,7 @@ class LiveAlignment:
     # ------------------------------------------------------------------ state
 
     def reset(self) -> None:
-        """Discard all samples."""
+        """Discard all samples, and begin again with empty streams."""
         p = self.parameters
         self._first_stamp_ns: int | None = None
         # after the correction of its delay, a late-stamped stream lags the others by it
@@ -219,7 +219,7 @@ class LiveAlignment:
             self.partners.judge(rows.end, self.parameters)
 
     def take_reference(self, sample: ReferenceSample) -> None:
-        """Add a reference (GNSS) velocity."""
+        """Add a reference velocity, unless it is invalid, and count it."""
         tally = self.tally["reference"]
         tally["received"] += 1
         valid, _, unmeasured = self._reference_covariance(sample.covariance)
@@ -234,7 +234,7 @@ class LiveAlignment:
         self._keep(Stream.REFERENCE, sample)
 
     def take_imu(self, sample: ImuSample) -> None:
-        """Add attitude and angular velocity."""
+        """Add the attitude and angular velocity of a sample, unless both are invalid, and count it."""
         tally = self.tally["imu"]
         tally["received"] += 1
         stamp_ns, given, angular_velocity = sample
