@@ -176,7 +176,10 @@ def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> 
 
 
 def _navigation(bags: Sequence[Path], found: Sequence[_Replayed]) -> Mapping[tuple[str, str], Navigation]:
-    """Return the dead reckoning of every bag, corrected by every other one's calibration."""
+    """Return the dead reckoning of every bag, corrected by every other bag's calibration.
+
+    Keys are (calibrated bag, verified bag).
+    """
     navigation = {}
     for calibrated, one in zip(bags, found, strict=True):
         for verified, other in zip(bags, found, strict=True):

@@ -44,7 +44,7 @@ class RecentWorth:
 
     def __init__(self) -> None:
         self._model = ""
-        self._looks: deque[tuple[float, PredictedDrift]] = deque()
+        self._drifts: deque[tuple[float, PredictedDrift]] = deque()
         self._within_since_s: float | None = None
         self.is_good = False
         self.taken_back: Reason | None = None
@@ -56,19 +56,19 @@ class RecentWorth:
         """
         was_good = self.is_good
         if rejected or model != self._model:
-            self._looks.clear()
+            self._drifts.clear()
             self._model, self._within_since_s, self.is_good = model, None, False
             if rejected:
                 self.taken_back = None  # the findings say why
             elif was_good:
                 self.taken_back = finding("WORTH_OF_ANOTHER_MODEL", model=model)
-        if self._looks and self._looks[-1][0] == now_s:
-            self._looks.pop()
-        self._looks.append((now_s, drift))
-        while self._looks[0][0] < now_s - STANDS_S:
-            self._looks.popleft()
+        if self._drifts and self._drifts[-1][0] == now_s:
+            self._drifts.pop()
+        self._drifts.append((now_s, drift))
+        while self._drifts[0][0] < now_s - STANDS_S:
+            self._drifts.popleft()
         predicted = PredictedDrift(
-            *(sorted(drifts)[len(drifts) // 2] for drifts in zip(*(d for _, d in self._looks), strict=True))
+            *(sorted(drifts)[len(drifts) // 2] for drifts in zip(*(d for _, d in self._drifts), strict=True))
         )
         if self.is_good and predicted.both > WITHDRAWN_RATIO * target:
             self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=predicted.both)
@@ -126,14 +126,14 @@ class Card:
         """Start without statuses."""
         self._began_s = now_s
         self._received: deque[tuple[float, Mapping[str, int]]] = deque(maxlen=RATED_OVER)
-        self._came_s: dict[str, float] = {}
-        self._driven_s = dict.fromkeys(SECTORS, 0.0)
+        self._came_s: dict[str, float] = {}  # time of each stream's newest message
+        self._driven_s = dict.fromkeys(SECTORS, 0.0)  # time on each course
         self._newest_ns: int | None = None
         self._shown_s = 0.0
-        self._squares, self._looks = 0.0, 0
+        self._squared_speeds, self._n_speeds = 0.0, 0
         self._worth, self._remaining = RecentWorth(), RemainingTime()
         self._outlook: Outlook | None = None
-        self._planned_s = self._planned_shown_s = -math.inf
+        self._planned_s = self._planned_shown_s = -math.inf  # when `_outlook` was computed: by the clock, by DVL stamps
 
     def values(
         self,
@@ -179,7 +179,7 @@ class Card:
         motion, step = calibrator.latest_motion(), self._dvl_time_step(calibrator.last_ns)
         self._shown_s += step
         if motion is not None and motion.speed > 0.0:
-            self._squares, self._looks = self._squares + motion.speed**2, self._looks + 1
+            self._squared_speeds, self._n_speeds = self._squared_speeds + motion.speed**2, self._n_speeds + 1
             if motion.heading is not None:
                 sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
                 self._driven_s[SECTORS[sector]] += step
@@ -228,7 +228,7 @@ class Card:
         """Return the suggested manoeuvre, computed again after `REPLANNED_EVERY_S`."""
         if self._outlook is None or now_s - self._planned_s >= REPLANNED_EVERY_S:
             self._planned_s, self._planned_shown_s = now_s, self._shown_s
-            parameters, mean_square = calibrator.parameters, self._squares / max(self._looks, 1)
+            parameters, mean_square = calibrator.parameters, self._squared_speeds / max(self._n_speeds, 1)
             first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
             seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
             noise = noise_of_a_second(estimate, parameters, seconds, mean_square)

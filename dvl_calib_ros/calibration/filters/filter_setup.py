@@ -38,11 +38,11 @@ class Assembler:
         self._motion_is_noise = first.motion_is_noise
         priors = [prior(model, parameters) for model in self.models]
         self.prior = GaussianState(np.array([begin.x for begin in priors]), np.array([begin.p for begin in priors]))
-        given = initial or {}
-        self._starts = [given.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
-        self._floors = [_floor(model, parameters) for model in self.models]
-        held = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
-        self.start = GaussianState(np.array([state.x for state in held]), np.array([state.p for state in held]))
+        initial = initial or {}
+        self._starts = [initial.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
+        self._floors = [_floor(model, parameters) for model in self.models]  # covariance that no data reduce
+        starts = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
+        self.start = GaussianState(np.array([state.x for state in starts]), np.array([state.p for state in starts]))
         # gate by the number of unmeasured axes
         self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m + 1)])
         self._gate = np.full((len(self.models), 1), self._gates[0])

@@ -50,7 +50,7 @@ class TimeBlocks:
         self._vector = np.zeros((0, 0, 0))
         self.total: tuple[Array, Array] = np.zeros((0, 0, 0)), np.zeros((0, 0))
         self.count = 0
-        self._each = 1  # additions in a full block
+        self._per_block = 1  # additions in a full block
         self._in_last = 0
         self.weight = 0.0
 
@@ -60,10 +60,15 @@ class TimeBlocks:
         return self._information[: self.count], self._vector[: self.count]
 
     def add(self, information: Array, vector: Array, weight: float) -> None:
-        """Add the information of a stretch: Λ_b (K, n, n), y_b (K, n). weight: equivalent number of samples."""
+        """Add the information of a stretch to the newest block, or to a new one if that is full.
+
+        At MAX_BLOCKS blocks, neighbours are joined and a full block holds twice as many stretches.
+
+        information, vector: Λ_b (K, n, n) and y_b (K, n). weight: equivalent number of samples.
+        """
         self.weight += weight
         self.total = (self.total[0] + information, self.total[1] + vector) if self.count else (information, vector)
-        if self.count and self._in_last < self._each:
+        if self.count and self._in_last < self._per_block:
             self._information[self.count - 1] += information
             self._vector[self.count - 1] += vector
             self._in_last += 1
@@ -76,7 +81,7 @@ class TimeBlocks:
             self.count = MAX_BLOCKS // 2
             for sums in (self._information, self._vector):
                 sums[: self.count] = sums[0::2] + sums[1::2]
-            self._each *= 2
+            self._per_block *= 2
         self._information[self.count], self._vector[self.count] = information, vector
         self.count += 1
         self._in_last = 1

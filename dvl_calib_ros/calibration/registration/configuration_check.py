@@ -264,7 +264,7 @@ def wrong_axes(
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[others].any():
-            mirrored, other = sorted(others, key=lambda each: not is_turned[each])
+            mirrored, other = sorted(others, key=lambda axis: not is_turned[axis])
             # the same data, read in the opposite axes, have the other axis inverted
             opposite = None if ahead else _OTHER_AXES.get(dvl_axes)
             alike = f" (read as {dvl_axes}; read as {opposite}, {'xyz'[other]} does)" if opposite else ""

@@ -42,15 +42,15 @@ class ThinnedBlock(NamedTuple):
     ) -> ThinnedBlock:
         """Return the thinned columns of a block. noise_dvl: (3, 3) (m/s)²."""
         first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
-        kept = first + _thinned_seconds(dvl.times[first:last])
-        thinned_dvl = DvlColumns(dvl.times[kept], dvl.velocity[kept].copy())
+        dvl_rows = first + _thinned_seconds(dvl.times[first:last])
+        thinned_dvl = DvlColumns(dvl.times[dvl_rows], dvl.velocity[dvl_rows].copy())
         first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
-        kept = first + _thinned_seconds(imu.times[first:last])
+        imu_rows = first + _thinned_seconds(imu.times[first:last])
         # rates are averaged: the noise of one sample exceeds the change until the next kept one
         reach = 0.5 * KEPT_EVERY_S
         first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
-        rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[kept], reach)
-        thinned_imu = ImuColumns(imu.times[kept], imu.orientation[kept], rates)
+        rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[imu_rows], reach)
+        thinned_imu = ImuColumns(imu.times[imu_rows], imu.orientation[imu_rows], rates)
         # copies, because views would keep the whole arrays in memory
         return ThinnedBlock(thinned_dvl, noise_dvl, reference._replace(velocity=reference.velocity.copy()), thinned_imu)
 

@@ -323,7 +323,10 @@ class LiveAlignment:
         self._on_restart(back_s)
 
     def _advance(self) -> None:
-        """Advance the rows whose partners are decided; note what the next ones wait for."""
+        """Pair the rows whose attitude and reference are decided, and note the stamps that the next rows wait for.
+
+        Attitudes are decided first, because a reference in an earth frame needs one.
+        """
         partners, end, horizon_ns = self.partners, self.rows.end, self.horizon_ns
         self._waits_for.clear()
         self._deadline_ns = NEVER_NS

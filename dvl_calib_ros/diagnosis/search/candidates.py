@@ -199,7 +199,13 @@ def _std(effect: Effect, p: int, n_recordings: int) -> Array:
 
 
 def _shortlisted(table: LinearisedModel, present: Sequence[int], cost: Sequence[float]) -> list[int]:
-    """Return all variants of the fit and the most promising others, alone or in addition."""
+    """Return the indices of all variants of the fit, and of the most promising others.
+
+    A variant is promising by its gain in deviance, less its cost: in addition to the fit, or with less weight instead
+    of an effect of the fit or alone. At most KEPT_VARIANTS of one effect are kept.
+
+    present: indices of the variants of the fit. cost: price of each variant.
+    """
     misfit, empty_misfit = table.misfit(present), table.misfit([])
     gains: dict[int, float] = {}
     adds: dict[int, float] = {}

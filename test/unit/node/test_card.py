@@ -148,7 +148,7 @@ def test_a_dvl_that_is_silent_or_far_ahead_by_one_stamp_makes_nothing_good_enoug
     assert {each["next code"] for each in looks(card, at_the_goal, [1.0] * 10)} == {"NEXT_STANDS"}
     silent = list(looks(card, at_the_goal, [1.0] * 300, rate=0.0, since_s=9.0))
     assert {each["next code"] for each in silent} == {"NEXT_STANDS"} and silent[-1]["seconds"] == "21"
-    assert len(card._worth._looks) <= STANDS_S  # what is kept stays bounded
+    assert len(card._worth._drifts) <= STANDS_S  # what is kept stays bounded
     ahead = next(looks(card, at_the_goal, [1.0], since_s=1e6))
     assert ahead["next code"] == "NEXT_STANDS"
 
