@@ -331,6 +331,6 @@ def calibrated(
     replayed = replay(recording, parameters, topics, on_progress)
     found = extrinsics_of_replay(replayed, name)
     if found is None:
-        raise InputError(f"{name}: no sample of it could be used to calibrate; ask dvl-calib doctor")
+        raise InputError(f"{name}: none of its samples could be used to calibrate; examine it with dvl-calib doctor")
     known = {str(reason) for reason in replayed.findings}
     return Calibrated(found, [note for note in replayed.notes if note not in known])

@@ -119,7 +119,7 @@ def cross_check(
     found = run_all(partial(_replay_or_nothing, parameters, tuple(models), given), bags, workers, on_progress)
     if not any(each.moments for each in found):
         if failed := [f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in each.failed]:
-            raise InputError(f"nothing is left to check: {failed[0]}")
+            raise InputError(f"no bag is left to check: {failed[0]}")
         raise InputError(f"{', '.join(map(str, bags))}: no sample has a reference to check against; set --gnss-topic")
     uncorrected = np.full(len(bags), np.nan)
     corrected = np.full((len(bags), len(models), len(bags)), np.nan)

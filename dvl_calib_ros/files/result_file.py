@@ -223,7 +223,9 @@ def check_in_folder(path: Path, folder: Path) -> None:
     This is for names set at run time: permission to set a parameter must not include writing to any file.
     """
     if path.suffix != ".yaml" or Path(os.path.realpath(path)).parent != Path(os.path.realpath(folder)):
-        raise InputError(f"{path}: at run time only a .yaml file in {folder} can be named; name others at the start")
+        raise InputError(
+            f"{path}: a running node accepts only a .yaml file in {folder}; name other files when it starts"
+        )
 
 
 def save_result(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> None:

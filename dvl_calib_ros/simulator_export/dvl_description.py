@@ -82,9 +82,9 @@ class DvlDescription:
         if not all(math.isfinite(value) for vector in vectors for value in vector):
             raise InputError(f"{self.source}: holds numbers that are not finite; diagnose again")
         if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
-            raise InputError(f"{self.source}: rate_hz is {self.rate_hz:g}, which cannot be; diagnose again")
+            raise InputError(f"{self.source}: rate_hz is {self.rate_hz:g}, which is impossible; diagnose again")
         if any(std < 0.0 for std in self.noise_std or ()):
-            raise InputError(f"{self.source}: a standard deviation is negative, which cannot be; diagnose again")
+            raise InputError(f"{self.source}: a standard deviation is negative, which is impossible; diagnose again")
 
 
 def load_description(path: Path, sample: int | None = None) -> DvlDescription:

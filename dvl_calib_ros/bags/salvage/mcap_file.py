@@ -120,7 +120,7 @@ def _check_no_chunk(file: BinaryIO, start: int, size: int) -> None:
             raise DamagedError(f"its index would begin at byte {start}, before {'messages' if opcode else 'zeros'}")
         if opcode == Opcode.FOOTER:
             if at != size - _FOOTER.size - RECORD_HEAD.size:
-                raise DamagedError("its index is of another part of it: recordings joined in one file")
+                raise DamagedError("its index belongs to another part: several recordings were joined in one file")
             return
         at += RECORD_HEAD.size + length
 
