@@ -86,4 +86,4 @@ def test_a_bag_whose_replay_fails_is_named_and_the_others_are_checked(bags, tmp_
     monkeypatch.setattr(evaluation_of_bags, "_replay_one", lambda *_: real())
     assert main(["evaluate", *map(str, bags), "--models", "M3", "--jobs", "1"]) == 2
     error = capsys.readouterr().err
-    assert "nothing is left to check" in error and "TypeError" in error and error.count("\n") == 1
+    assert "no bag is left to check" in error and "TypeError" in error and error.count("\n") == 1
