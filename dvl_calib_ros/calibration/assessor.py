@@ -323,7 +323,7 @@ class NonlinearEstimators:
     @property
     def arm_effect(self) -> float | None:
         """Velocity error by an unknown arm without turn rates, σ as a share of the speed; None if rates are known."""
-        return self._first(lambda each: each.arm_effect)
+        return self._first(lambda estimator: estimator.arm_effect)
 
     @property
     def is_horizontal(self) -> bool:
@@ -338,41 +338,41 @@ class NonlinearEstimators:
     @property
     def doubt(self) -> Reason | None:
         """Reason against models that assume what these estimators estimate."""
-        return self._first(lambda each: each.doubt)
+        return self._first(lambda estimator: estimator.doubt)
 
     @property
     def suggestion(self) -> Reason | None:
         """Configuration that fits the data, if the given one is grossly wrong."""
-        return self._first(lambda each: each.suggestion)
+        return self._first(lambda estimator: estimator.suggestion)
 
     @property
     def suggestion_so_far(self) -> Reason | None:
         """`suggestion` by the latest evaluation, without waiting."""
-        return self._first(lambda each: each.suggestion_so_far)
+        return self._first(lambda estimator: estimator.suggestion_so_far)
 
     @property
     def registration_so_far(self) -> Registration | None:
         """Registration of clocks and frames by the latest evaluation; None if not known."""
-        return self._first(lambda each: each.registration_so_far)
+        return self._first(lambda estimator: estimator.registration_so_far)
 
     def residuals(self, *, fresh: bool) -> Residuals | None:
         """Return the calibration's residuals, evaluated now if `fresh`, else the latest; None if not available."""
-        return self._first(lambda each: each.residuals(fresh=fresh))
+        return self._first(lambda estimator: estimator.residuals(fresh=fresh))
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
         """Streams kept for verification, and the stamp (ns) of their time 0; None if nothing was kept."""
-        return self._first(lambda each: each.recording)
+        return self._first(lambda estimator: estimator.recording)
 
     @property
     def slow_noise(self) -> SlowNoise | None:
         """Slow errors of reference and attitude as estimated; None if not estimated."""
-        return self._first(lambda each: each.slow_noise)
+        return self._first(lambda estimator: estimator.slow_noise)
 
     @property
     def beam_fault(self) -> BeamFault | None:
         """Most significant fault of one beam of the DVL; None if not tested."""
-        return self._first(lambda each: each.beam_fault)
+        return self._first(lambda estimator: estimator.beam_fault)
 
     @property
     def n_days(self) -> int:

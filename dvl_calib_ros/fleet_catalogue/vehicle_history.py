@@ -160,7 +160,7 @@ def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
         NeedsPerson(code, error or members[0].rows[0]["reason"], tuple(member.recording for member in members), vehicle)
         for (vehicle, code, error), members in groups.items()
     ]
-    return sorted(found, key=lambda each: -len(each.recordings))
+    return sorted(found, key=lambda group: -len(group.recordings))
 
 
 def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:

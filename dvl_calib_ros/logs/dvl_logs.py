@@ -80,7 +80,7 @@ def read_dvl_log(path: Path) -> DvlLog:
     if not log.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"
         raise InputError(f"{path}: no velocity that can be used ({why})")
-    in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda each: each.stamp_ns)
+    in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda one: one.stamp_ns)
     log.left_out["of a time that was there already"] += len(log.samples) - len(in_order)
     return log._replace(samples=in_order, left_out=+log.left_out)
 

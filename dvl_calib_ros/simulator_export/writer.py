@@ -72,7 +72,7 @@ class Export:
 def export(name: str, simulator: Simulator, description: DvlDescription) -> Export:
     """Return the settings of a simulator for a DVL."""
     settings = simulator.write(description)
-    missing = sorted(_missing(simulator.title, settings, description), key=lambda each: -(each.error or 0.0))
+    missing = sorted(_missing(simulator.title, settings, description), key=lambda effect: -(effect.error or 0.0))
     ambiguous = tuple(
         f"the data could not distinguish {', '.join(names)}; {names[0]} is used" for names in description.ambiguous
     )

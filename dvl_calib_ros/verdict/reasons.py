@@ -159,7 +159,7 @@ def is_cause(reason: Reason) -> bool:
 
 def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
     """Sort by severity, the worst first; within one severity in causal order."""
-    return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), causal_rank(each)))
+    return sorted(reasons, key=lambda reason: (_WORST_FIRST.index(reason.severity), causal_rank(reason)))
 
 
 def lookup(kinds: Iterable[Kind]) -> str:

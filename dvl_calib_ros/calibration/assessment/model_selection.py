@@ -95,7 +95,7 @@ class Selection:
     def take(self, from_ns: int, evidence: Evidence) -> None:
         """Use an estimator's evidence from this stamp on."""
         if evidence is not NO_EVIDENCE:
-            insort(self._coming, (from_ns, evidence), key=lambda each: each[0])
+            insort(self._coming, (from_ns, evidence), key=lambda coming: coming[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         """Take DVL samples (N,) in order of stamps, and whether they were paired."""

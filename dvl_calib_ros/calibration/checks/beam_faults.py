@@ -97,7 +97,7 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
         inflation = float(inflations([equations], x[None], posterior[None])[0, -1])
         candidates.append((float(x[-1]), math.sqrt(posterior[-1, -1]) * inflation, effect))
     no_beam = (0.0, 1.0, N_EFFECTS - 1)
-    share, std, effect = max(candidates, key=lambda each: abs(each[0]) / each[1], default=no_beam)
+    share, std, effect = max(candidates, key=lambda fault: abs(fault[0]) / fault[1], default=no_beam)
     if effect == N_EFFECTS - 1:  # the scale that grows with speed
         return None
     beam = effect - 1

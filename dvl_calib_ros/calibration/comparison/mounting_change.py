@@ -218,7 +218,7 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
     if len(calibrations) < 2:
         name = calibrations[0].name if calibrations else "nothing"
         raise InputError(f"{name}: one alone cannot be compared; name two")
-    ordered = sorted(calibrations, key=lambda each: each.first_ns)  # stable for equal stamps
+    ordered = sorted(calibrations, key=lambda one: one.first_ns)  # stable for equal stamps
     ordered = [replace(calibration, value=_near(calibration.value, ordered[0].value)) for calibration in ordered]
     pairs = [Difference.between(*two) for two in combinations(ordered, 2)]
     if not any(pair.compared[MOUNTING].any() for pair in pairs):

@@ -115,12 +115,12 @@ class Model:
     @cached_property
     def of_day(self) -> NDArray[np.intp]:
         """Indices (u,) of the states that differ per recording (`Nuisance.per_recording`)."""
-        return self._nuisance_that(lambda each: each.per_recording)
+        return self._nuisance_that(lambda spec: spec.per_recording)
 
     @cached_property
     def not_handed_on(self) -> NDArray[np.intp]:
         """Indices (u,) of the states that a result file does not pass on (`Nuisance.handed_on`)."""
-        return self._nuisance_that(lambda each: not each.handed_on)
+        return self._nuisance_that(lambda spec: not spec.handed_on)
 
     def _nuisance_that(self, is_so: Callable[[Nuisance], bool]) -> NDArray[np.intp]:
         return np.array([self.n_errors + i for i, spec in enumerate(self.nuisance) if is_so(spec)], dtype=np.intp)

@@ -181,7 +181,7 @@ def _fit_in_frame(fit: MotionFit, nominal: Array) -> _FrameFit | None:
         return None
     turned = by_mounting[1]
     also_turned = turned is not None and misfit(turned, body_turned) < FITS_BELOW
-    return _FrameFit(min(fitted, key=lambda each: each.level), also_turned)
+    return _FrameFit(min(fitted, key=lambda fit: fit.level), also_turned)
 
 
 def nearest(

@@ -287,9 +287,9 @@ def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: 
     possible = [fit for fit in fits if fit is not None and _is_possible(fit)]
     if not possible:
         return None
-    closest = min(possible, key=lambda each: each.level)
+    closest = min(possible, key=lambda fit: fit.level)
     as_good = [candidate for candidate in possible if _is_as_good(motion, quick, candidate, closest, rotation)]
-    return min(as_good, key=lambda each: abs(each.x[RHO]) + abs(each.dvl_delay_s))
+    return min(as_good, key=lambda fit: abs(fit.x[RHO]) + abs(fit.dvl_delay_s))
 
 
 def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
