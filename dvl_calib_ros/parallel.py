@@ -65,7 +65,7 @@ def run_all(
         if isinstance(outcome, Lost):
             if workers.dask:
                 raise InputError(f"--dask {workers.dask}: {outcome.why}; restart the cluster")
-            raise InputError("a worker process was killed, perhaps for want of memory; use fewer --jobs")
+            raise InputError("a worker process was killed, perhaps for lack of memory; use fewer --jobs")
         found[index] = outcome
         on_progress(len(found) / len(items))
     return [found[index] for index in range(len(items))]
@@ -104,7 +104,7 @@ def _as_done_on_cores(
     while suspects := (yield from _until_one_dies(work, remaining, jobs)):
         for suspect in suspects:
             if (yield from _until_one_dies(work, iter([suspect]), 1)):
-                yield suspect[0], Lost("the process that worked on it was killed, perhaps for want of memory")
+                yield suspect[0], Lost("the process that worked on it was killed, perhaps for lack of memory")
 
 
 def _until_one_dies(
@@ -184,7 +184,7 @@ def _as_done_on_dask(
         try:
             client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
         except TimeoutError as error:
-            raise InputError(f"--dask {address}: the scheduler has no workers; start some") from error
+            raise InputError(f"--dask {address}: the scheduler has no workers; start workers") from error
         # Dask repeats the work of a dead worker elsewhere, as long as the futures exist
         try:
             yield from _as_done(client, dict(enumerate(client.map(work, list(items), pure=False))), address)
@@ -236,12 +236,12 @@ def _as_done(client: Any, pending: dict[int, Any], address: str) -> Iterator[tup
             wait_for(list(pending.values()), timeout=ALL_WORKERS_LOST_S, return_when="FIRST_COMPLETED")
         done = [index for index, future in pending.items() if future.done()]
         if not done and not client.scheduler_info().get("workers"):
-            raise InputError(f"--dask {address}: all workers are gone, {len(pending)} pieces not done; start some")
+            raise InputError(f"--dask {address}: all workers are gone, {len(pending)} pieces not done; start workers")
         for index in done:
             try:
                 outcome = pending[index].result(timeout=ALL_WORKERS_LOST_S)
             except KilledWorker:
-                outcome = Lost("the workers that worked on it were killed, perhaps for want of memory")
+                outcome = Lost("the workers that worked on it were killed, perhaps for lack of memory")
             except TimeoutError:
                 if pending[index].status == "error":
                     raise

@@ -94,8 +94,8 @@ MUTANTS = (
     Mutant(
         "tie of discovery",
         "dvl_calib_ros/discovery/topic_choice.py",
-        "ranked.sort(key=lambda each: (each[0], each[1].topic))",
-        "ranked.sort(key=lambda each: each[0])",
+        "sorted((order, preview.topic) for order, preview in ranked)",
+        "sorted(((order, preview.topic) for order, preview in ranked), key=lambda entry: entry[0])",
         (UNIT + "discovery/test_choose.py",),
     ),
     Mutant(

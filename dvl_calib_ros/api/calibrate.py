@@ -111,7 +111,7 @@ def compare(
         if isinstance(given, Calibration):
             extrinsics = extrinsics_of_replay(given.replayed, name)
             if extrinsics is None:
-                raise InputError(f"{name}: no sample of it could be used to calibrate; leave it out")
+                raise InputError(f"{name}: none of its samples could be used to calibrate; leave it out")
             found.append(extrinsics)
         elif is_bag(Path(given)):
             topics = (dvl_topic, gnss_topic, imu_topic)

@@ -47,9 +47,11 @@ DROPOUTS = "DVL_DROPOUTS"
 class Recordings:
     """Comparison of several recordings that were calibrated individually.
 
-    comparison: None if fewer than two recordings could be calibrated. unchecked: names of recordings that could not be.
-    overlapping: names of two with DVL data at the same time. pauses_ns: gaps between recordings. number: number of
-    recordings, counting bags of the same time as one.
+    comparison: None if fewer than two recordings could be calibrated.
+    unchecked: names of recordings that could not be.
+    overlapping: names of two with DVL data at the same time.
+    pauses_ns: gaps between recordings.
+    number: number of recordings, counting bags of the same time as one.
     """
 
     comparison: Comparison | None
@@ -94,9 +96,10 @@ def checked_replay(
     """Replay after checking several recordings, or an initial calibration, for consistency.
 
     merge: calibrate several recordings together even if the mounting moved; the move becomes a note instead of the
-    verdict. An `initial_calibration` that the data contradict is not used, with a finding. mounting_is_guessed:
-    mounting_rpy was not configured; if the estimate is far from it, the estimate becomes the mounting, and the replay
-    is repeated. contradictions: findings of discovery; those on frames affect the verdict. Raises InputError.
+      verdict. An `initial_calibration` that the data contradict is not used, with a finding.
+    mounting_is_guessed: mounting_rpy was not configured; if the estimate is far from it, the estimate becomes the
+      mounting, and the replay is repeated.
+    contradictions: findings of discovery; those on frames affect the verdict. Raises InputError.
     """
     topics = topics or Topics()
     if not isinstance(recording, Recording):
@@ -112,19 +115,13 @@ def checked_replay(
         recordings = _calibrated_individually(recording, parameters, topics, progress_of)
     replayed = _replay_from_valid_start(recording, parameters, topics, progress_of, parts, with_history)
     if mounting_is_guessed and (rpy := _mounting_instead_of_guess(replayed.result)) is not None:
-        better = parameters.replace(mounting_rpy=rpy)
         return checked_replay(
-            recording,
-            better,
-            topics,
-            on_progress,
-            merge=merge,
-            with_history=with_history,
-            contradictions=contradictions,
-        )
+            recording, parameters.replace(mounting_rpy=rpy), topics, on_progress, merge=merge,
+            with_history=with_history, contradictions=contradictions,
+        )  # fmt: skip
     if contradictions:
         result = replayed.result
-        judged = {name: _with_frame_doubts(each, contradictions) for name, each in result.verifications.items()}
+        judged = {name: _with_frame_doubts(verified, contradictions) for name, verified in result.verifications.items()}
         replayed = replace(replayed, result=replace(result, verifications=judged))
     return replayed if recordings is None else _with_common_verdict(replayed, recordings, merge)
 
@@ -140,14 +137,14 @@ def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reas
     """
     is_rejected = verification.verdict is Severity.REJECT
     kept = []
-    for each in contradictions:
-        if each.severity is Severity.MARGINAL:
-            kept.append(each)
-        elif each.code in DECISIVE or (is_rejected and is_cause(each)):
-            kept.append(each.weighed(Severity.REJECT))
-    if any(each.code == "MOUNTING_CONTRADICTED" for each in kept):  # which says it with the option to type
-        reasons = (each for each in verification.reasons if "MOUNTING_FITS" not in {one.code for one in each.causes})
-        verification = replace(verification, reasons=tuple(reasons))
+    for contradiction in contradictions:
+        if contradiction.severity is Severity.MARGINAL:
+            kept.append(contradiction)
+        elif contradiction.code in DECISIVE or (is_rejected and is_cause(contradiction)):
+            kept.append(contradiction.weighed(Severity.REJECT))
+    if any(reason.code == "MOUNTING_CONTRADICTED" for reason in kept):  # which says it with the option to type
+        without = [reason for reason in verification.reasons if "MOUNTING_FITS" not in [c.code for c in reason.causes]]
+        verification = replace(verification, reasons=tuple(without))
     return verification.with_objections(kept) if kept else verification
 
 
@@ -202,7 +199,7 @@ def _calibrated_individually(
             unchecked.append(name)
         else:
             found.append(extrinsics)
-    aided = [each for each in found if MODELS[each.model].aided]
+    aided = [reason for reason in found if MODELS[reason.model].aided]
     found = aided or found  # models without GNSS assume no current, so they are not compared with models with GNSS
     try:
         comparison = compare(found) if len(found) > 1 else None
@@ -259,15 +256,15 @@ def _with_common_verdict(replayed: Replayed, recordings: Recordings, merge: bool
     for name, verification in result.verifications.items():
         objections = recordings.objections(name, parted=len(result.days) >= recordings.number)
         if name == result.selected and merge:
-            notes += [f"merged as asked: {each.sentence}" for each in objections]
+            notes += [f"merged as asked: {objection.sentence}" for objection in objections]
         verifications[name] = verification if merge else verification.with_objections(objections)
     if recordings.unchecked:
         names = ", ".join(recordings.unchecked)
         notes.append(f"{names}: too little to be calibrated alone, so its mounting cannot be compared with the others'")
     found, counts = _without_pauses(replayed.findings, result.counts, len(recordings.pauses_ns))
-    left_out = {str(each) for each in replayed.findings} - {str(each) for each in found}
+    left_out = {str(reason) for reason in replayed.findings} - {str(reason) for reason in found}
     kept = [note for note in replayed.notes if note not in left_out]
-    kept += [str(each) for each in found if str(each) not in kept]
+    kept += [str(reason) for reason in found if str(reason) not in kept]
     return replace(
         replayed,
         result=replace(result, verifications=verifications, counts=counts),
@@ -286,7 +283,7 @@ def _without_pauses(
     remaining = max(dropouts - pauses, 0)
     if remaining == dropouts:
         return findings, counts
-    kept = [each for each in findings if each.code != DROPOUTS]
+    kept = [reason for reason in findings if reason.code != DROPOUTS]
     if remaining:
         kept.append(finding(DROPOUTS, count=remaining))
     return tuple(kept), {**counts, "dvl": {**counts["dvl"], "dropouts": remaining}}
@@ -334,6 +331,6 @@ def calibrated(
     replayed = replay(recording, parameters, topics, on_progress)
     found = extrinsics_of_replay(replayed, name)
     if found is None:
-        raise InputError(f"{name}: no sample of it could be used to calibrate; ask dvl-calib doctor")
-    known = {str(each) for each in replayed.findings}
+        raise InputError(f"{name}: none of its samples could be used to calibrate; examine it with dvl-calib doctor")
+    known = {str(reason) for reason in replayed.findings}
     return Calibrated(found, [note for note in replayed.notes if note not in known])

@@ -59,9 +59,11 @@ KEPT_STATES, KEPT_VELOCITIES = 300, 800
 class ModelHistory:
     """One model over time, at the N stamps of its `RunHistory`.
 
-    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names; std: (N, n).
-    misalignment_covariance: (N, 3, 3) rad². nis: (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the
-    previous stamp (about 1 for a consistent filter), nan if none was used.
+    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names.
+    std: (N, n).
+    misalignment_covariance: (N, 3, 3) rad².
+    nis: (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the previous stamp (about 1 for a consistent
+      filter), nan if none was used.
     """
 
     state: Array
@@ -76,8 +78,8 @@ class RunHistory:
 
     stamps_ns: (N,) of the rows of `models` and paired_share; a model's state includes all samples up to the stamp.
     paired_share: (N,) share of the DVL samples since the previous stamp with a reference, nan if none was decided.
-    dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, corrected to the reference point. paired_ns
-    (P,), reference_velocity (P, 3): DVL samples with a reference, and the reference, m/s, body frame.
+    dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, corrected to the reference point.
+    paired_ns (P,), reference_velocity (P, 3): DVL samples with a reference, and the reference, m/s, body frame.
     """
 
     stamps_ns: Stamps
@@ -138,17 +140,17 @@ class Recorder:
         self._paired = Thinned(KEPT_VELOCITIES, self._expected)
 
     def take(self, block: AlignedBlock) -> None:
-        """Add rows."""
+        """Add aligned rows: stamps and pairing of all, DVL and reference velocities of the usable and paired ones."""
         self._stamps_ns.append(block.stamps_ns)
         self._pairing.append(block.pairing)
         usable, paired = block.part(block.usable), block.part(block.paired)
         if len(usable):
-            seen = self._observer.observe(usable, Needs.NOTHING, np.zeros(2))
-            self._dvl.add(usable.stamps_ns, seen.velocity_at_reference)
+            observed = self._observer.observe(usable, Needs.NOTHING, np.zeros(2))
+            self._dvl.add(usable.stamps_ns, observed.velocity_at_reference)
         if len(paired):
-            seen = self._observer.observe(paired, Needs.REFERENCE, np.zeros(2))
-            assert seen.reference_body is not None
-            self._paired.add(paired.stamps_ns, seen.reference_body)
+            observed = self._observer.observe(paired, Needs.REFERENCE, np.zeros(2))
+            assert observed.reference_body is not None
+            self._paired.add(paired.stamps_ns, observed.reference_body)
 
     def history(self, calibrator: Calibrator, estimates: Mapping[str, Estimate]) -> RunHistory:
         """Return the history after `Calibrator.finish`, ending with the estimates of its result."""
@@ -177,7 +179,11 @@ class Recorder:
 def _model_history(
     estimate: Estimate, calibrator: Calibrator, trace: StateTrace, numbers: Stamps, stamps_ns: Stamps
 ) -> ModelHistory:
-    """Return a model's state, σ and NIS at the given times and at the end."""
+    """Return a model's state, σ and NIS at the given times and at the end.
+
+    numbers: (N,) numbers of the rows after which the state is shown.
+    stamps_ns: (N,) their stamps.
+    """
     name = estimate.model
     nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
     states, covariances = [estimate.state[None]], [estimate.recording_covariance[None]]
@@ -189,8 +195,8 @@ def _model_history(
         sums.insert(0, list(zip(nis_sums.tolist(), used.tolist(), strict=True)))
     return ModelHistory(
         state=np.concatenate(states),
-        std=np.sqrt(np.concatenate([np.diagonal(each, axis1=1, axis2=2) for each in covariances])),
-        misalignment_covariance=np.concatenate([each[:, :3, :3] for each in covariances]),
+        std=np.sqrt(np.concatenate([np.diagonal(covariance, axis1=1, axis2=2) for covariance in covariances])),
+        misalignment_covariance=np.concatenate([covariance[:, :3, :3] for covariance in covariances]),
         nis=_share(np.concatenate(sums)) / MODELS[name].n_measurement,
     )
 
@@ -209,12 +215,17 @@ BLOCK_SIZE = 1024
 class Replayed:
     """Result of a replay.
 
-    notes: all messages to the user, including the findings. history: estimates over time, if requested.
-    reference_frame: of the reference's messages, None without any. dvl_frame: frame_id of the DVL. dvl_type: message
-    type of its topic. turned: whether its data were converted from forward-right-down. recordings: comparison of
-    several recordings; None without one. pause_s: time between recordings within the first to the last sample.
+    notes: all messages to the user, including the findings.
+    history: estimates over time, if requested.
+    reference_frame: of the reference's messages, None without any.
+    dvl_frame: frame_id of the DVL.
+    dvl_type: message type of its topic.
+    turned: whether its data were converted from forward-right-down.
+    recordings: comparison of several recordings; None without one.
+    pause_s: time between recordings within the first to the last sample.
     navigation: dead reckoning without and with the selected model's correction, on held-out data; None without a
-    reference. water: its properties in the recording, if any.
+      reference.
+    water: its properties in the recording, if any.
     """
 
     result: Result
@@ -275,8 +286,10 @@ def replay(
 ) -> Replayed:
     """Calibrate with a recording, or with bags that are read as one in order of log time.
 
-    on_progress: receives the share (0..1) read. with_history: collect a `RunHistory`; else on_rows receives the aligned
-    rows and on_restart is called, as by `Calibrator`. judged: verify on held-out data, including dead reckoning.
+    on_progress: receives the share (0..1) read.
+    with_history: collect a `RunHistory`; else on_rows receives the aligned rows and on_restart is called, as by
+      `Calibrator`.
+    judged: verify on held-out data, including dead reckoning.
     on_finished: receives the calibrator at the end. Raises InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration
@@ -324,10 +337,10 @@ def replay(
         in_earth=decoder.frame_of_reference is not VelocityFrame.BODY,
         is_level=calibrator.is_level,
     )
-    found += [each.weighed(Severity.WARNING) for each in against]
+    found += [reason.weighed(Severity.WARNING) for reason in against]
     of_drift = objections(navigation, drift_left_open(result.estimate, calibrator.parameters))
     of_all = calibrator.clock_objections(fresh=True) + [
-        each for each in against if each.severity is not Severity.WARNING
+        reason for reason in against if reason.severity is not Severity.WARNING
     ]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
         of_all += [] if result.counts["pairing"]["paired"] else [finding("NOTHING_COMPARED")]
@@ -372,7 +385,7 @@ def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
     estimate, judged = result.estimate, result.verifications.get(result.selected)
     if not estimate.used or result.first_ns is None or result.last_ns is None:
         return None
-    rejected = "" if judged is None else rejection(each.as_dict() for each in judged.reasons)
+    rejected = "" if judged is None else rejection(reason.as_dict() for reason in judged.reasons)
     return extrinsics_of(
         name,
         MODELS[estimate.model],
@@ -394,6 +407,7 @@ def _feed_all(
     calibrator: Calibrator,
     on_progress: Callable[[float], None],
 ) -> None:
+    """Feed all samples to a calibrator in order of arrival. on_progress: receives the share (0..1) fed."""
     start_ns, end_ns = recording.span_ns
     streams = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     for stretch in recording.stretches(streams, decoder):

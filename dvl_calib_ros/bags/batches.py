@@ -27,7 +27,9 @@ Index = NDArray[np.intp]
 class Batch(NamedTuple):
     """N consecutive messages of a recording, in order of log time.
 
-    log_ns: (N,). number: (N,) of each message's channel in `channels`. start, end: (N,) bounds of each in `content`.
+    log_ns: (N,).
+    number: (N,) of each message's channel in `channels`.
+    start, end: (N,) bounds of each in `content`.
     """
 
     log_ns: Times
@@ -143,7 +145,7 @@ def numbered_batch(
     log_ns: Sequence[int], number: Sequence[int] | Index, data: Sequence[bytes], channels: Mapping[int, Channel]
 ) -> Batch:
     """Return messages with log times and channel numbers (N,) as one batch, in their order."""
-    length = np.array([len(each) for each in data], dtype=np.intp)
+    length = np.array([len(message) for message in data], dtype=np.intp)
     end = np.cumsum(length)
     return Batch(times(log_ns), np.asarray(number, dtype=np.intp), end - length, end, b"".join(data), channels)
 

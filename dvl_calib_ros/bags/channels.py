@@ -110,7 +110,7 @@ class Decoder:
 def _decoded(store: Typestore, data: bytes, msgtype: str) -> Any:
     """Decode a message; some recorders pad it with zeros to a multiple of 4 or 8 bytes, which rosbags refuses."""
     if data[:2] not in PLAIN_CDR:
-        raise SerdeError(f"it begins with {data[:2].hex(' ') or 'nothing'}, plain CDR with 00 00 or 00 01")
+        raise SerdeError(f"it begins with {data[:2].hex(' ') or 'nothing'}, but plain CDR begins with 00 00 or 00 01")
     try:
         return store.deserialize_cdr(data, msgtype)
     except KeyError as error:

@@ -36,8 +36,9 @@ Stamps = NDArray[np.int64]
 class Part:
     """Messages of one channel in a window, in order.
 
-    arrival: (N,) positions among all messages read. log_ns: (N,). columns: of these messages, None if their layouts
-    differ.
+    arrival: (N,) positions among all messages read.
+    log_ns: (N,).
+    columns: of these messages, None if their layouts differ.
     """
 
     channel: Channel
@@ -90,14 +91,14 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
             channel = batch.channels[int(batch.number[index[0]])]
             position = np.concatenate([position for *_, position in chunks])
             if channel.topic in one_by_one or not length:
-                data = [each for batch, index, _ in chunks for each in batch.part(index).data()]
+                data = [message for batch, index, _ in chunks for message in batch.part(index).data()]
                 parts.append(Part(channel, position + arrived, log_ns[position], None, data, bag.decoder))
                 continue
             rows_of = [batch.rows(index, length) for batch, index, _ in chunks]
             contents = rows_of[0] if len(rows_of) == 1 else np.concatenate(rows_of)
             for columns, rows in layouts.split(channel, contents):
                 positions = position if len(rows) == len(position) else position[rows]
-                data = [] if columns is not None else [each.tobytes() for each in contents[rows]]
+                data = [] if columns is not None else [row.tobytes() for row in contents[rows]]
                 parts.append(Part(channel, positions + arrived, log_ns[positions], columns, data, bag.decoder))
         arrived += len(log_ns)
         yield Window(parts, int(log_ns[-1]))
@@ -239,6 +240,7 @@ class MessageColumns:
         return len(self._rows)
 
     def __getattr__(self, name: str) -> Any:
+        """Return a field of all messages as an array, or as further columns for a nested message."""
         layout, path = self._layout, self._prefix + name
         if path in layout.flags:
             return self._rows[path] != 0
@@ -266,7 +268,7 @@ def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
     walk = _LayoutWalk(store, data)
     walk.message("", msgtype)
     if not walk.at <= len(data) <= walk.at + _PADDING:
-        raise NoLayoutError("of another length than it says")
+        raise NoLayoutError("its length differs from the announced one")
     fields = walk.fields
     dtype = np.dtype(
         {
@@ -355,7 +357,7 @@ class _LayoutWalk:
     def _add(self, path: str, format_: Any, size: int) -> None:
         """Add a column of this NumPy format and number of bytes."""
         if len(self.fields) > _MOST_FIELDS:
-            raise NoLayoutError("more fields than are worth it")
+            raise NoLayoutError("more fields than can be read as columns")
         self.fields[path] = format_, self.at
         self.at += size
 

@@ -37,11 +37,13 @@ _MARKER = Channel("", "")
 class BagReader:
     """Context manager that reads one or more recordings as one, in order of log time.
 
-    known: type -> known versions of its definition, for recordings without. notes: messages to the user on damage,
-    complete after the last message. topics: topic -> message type. Raises InputError for a path that is no bag.
+    known: type -> known versions of its definition, for recordings without.
+    notes: messages to the user on damage, complete after the last message.
+    topics: topic -> message type. Raises InputError for a path that is no bag.
     """
 
     def __init__(self, paths: Sequence[Path], known: Mapping[str, Sequence[str]] | None = None) -> None:
+        """Open the files of all recordings, and list their topics; close all again if one cannot be opened."""
         self.notes: list[str] = []
         self.decoder = Decoder(known)
         self._stack = ExitStack()

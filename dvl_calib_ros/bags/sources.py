@@ -49,8 +49,8 @@ def open_bag(path: Path, shown: Path) -> tuple[Counter[Channel], tuple[int, int]
     try:
         with _reader(path) as (reader, channels):
             counts: Counter[Channel] = Counter()
-            for each in reader.connections:
-                counts[channels[each.id]] += each.msgcount
+            for connection in reader.connections:
+                counts[channels[connection.id]] += connection.msgcount
             return counts, (reader.start_time, reader.end_time - 1)
     except DamagedError as error:
         raise InputError(f"{shown}: a ROS 1 bag without a usable index ({error}); run rosbag reindex on it") from error
@@ -59,7 +59,7 @@ def open_bag(path: Path, shown: Path) -> tuple[Counter[Channel], tuple[int, int]
 def bag_batches(path: Path, topics: Collection[str]) -> Iterator[Batch]:
     """Yield the messages of topics of a .bag in ROS 1's layout. Raises DamagedError after the last."""
     with _reader(path) as (reader, channels):
-        wanted = [each for each in reader.connections if each.topic in topics]
+        wanted = [connection for connection in reader.connections if connection.topic in topics]
         if wanted:  # for rosbags an empty list means all
             yield from batched((at, channels[each.id], data) for each, at, data in reader.messages(wanted))
 
@@ -138,7 +138,9 @@ Salvage = Callable[[Path], Iterator[Salvaged]]
 class Source:
     """One recorded file.
 
-    path: as given by the user. counts: channel -> announced number of messages. span_ns: first and last log time.
+    path: as given by the user.
+    counts: channel -> announced number of messages.
+    span_ns: first and last log time.
     batches: messages of some topics, in order of log time; raises `DAMAGE` after the last, unless damage_noted.
     """
 
@@ -150,6 +152,7 @@ class Source:
         batches: Batches,
         damage_noted: bool = False,
     ) -> None:
+        """Describe a recorded file; the arguments are those of the class."""
         self.path = path
         self.counts = counts
         self.span_ns = min(span_ns[0], LATEST_NS), min(span_ns[1], LATEST_NS)
@@ -183,7 +186,7 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
         return _in_ros2(Source(shown, *open_bag(path, shown), partial(bag_batches, path)))
     # if the first bytes are lost or were never written, use the name
     kinds = {MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
-    kind = next((kinds[each] for each in kinds if magic.startswith(each)), storage_suffix(shown))
+    kind = next((kinds[kind] for kind in kinds if magic.startswith(kind)), storage_suffix(shown))
     if kind == ".mcap":
         return _open_or_salvage(path, shown, _open_mcap, salvage_mcap, notes)
     if kind == ".db3":
@@ -377,11 +380,13 @@ def message_of(error: Exception) -> str:
 class Database:
     """A recording in SQLite. Raises sqlite3.Error or DamagedError if it cannot be read.
 
-    counts: channel -> number of its messages. span_ns: first and last log time. astray: number of messages of unlisted
-    topics.
+    counts: channel -> number of its messages.
+    span_ns: first and last log time.
+    astray: number of messages of unlisted topics.
     """
 
     def __init__(self, path: Path) -> None:
+        """Count the messages of each channel, and find the first and the last log time (ns)."""
         self._path = path
         with closing(self._connection()) as connection:
             self._channels = _channels(connection)
@@ -424,7 +429,7 @@ class Database:
                 if sound:
                     yield self._batch(log_ns[:sound], number[:sound], data[:sound])
                 if sound < len(rows):
-                    raise DamagedError("a message is none")
+                    raise DamagedError("a message is missing or damaged")
             if error is not None:
                 raise error
 
@@ -477,5 +482,5 @@ def _rows(connection: sqlite3.Connection, query: str, types: tuple[type, ...]) -
     except UnicodeDecodeError as error:  # SQLite's message would contain the damaged names
         raise DamagedError("its tables are damaged") from error
     if any(type(value) is not expected for row in rows for value, expected in zip(row, types, strict=True)):
-        raise DamagedError("a table holds what recordings do not")
+        raise DamagedError("a table holds values that no recording has")
     return rows

@@ -73,6 +73,7 @@ class BagWriter:
     def __init__(
         self, path: Path, storage: Storage = Storage.MCAP, compression: Compression = Compression.NONE
     ) -> None:
+        """Check the path and the combination of storage and compression; nothing is written before `__enter__`."""
         if os.path.lexists(path):  # also true for a dangling link
             raise InputError(f"{path}: exists already; give another name, or remove it first")
         if storage is Storage.SQLITE3 and compression is Compression.CHUNK:
@@ -93,6 +94,7 @@ class BagWriter:
         self._attachments.append((name, media_type, data))
 
     def __enter__(self) -> BagWriter:
+        """Create the bag; remove it again if that fails."""
         try:
             self._new_part()
         except WriterError as error:  # created by another process since the check
@@ -107,6 +109,7 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Finish the bag and add its attachments; remove it if anything failed."""
         try:
             for part in self._parts:
                 part.writer.__exit__(kind, error, trace)
@@ -173,19 +176,19 @@ class BagWriter:
         if not others:
             return
         metadata = [load_yaml(path / "metadata.yaml", "metadata file") for path in (first, *others)]
-        whole, *rest = (each["rosbag2_bagfile_information"] for each in metadata)
-        for path, part in zip(others, rest, strict=True):
-            for name in part["relative_file_paths"]:
+        joined, *added = (document["rosbag2_bagfile_information"] for document in metadata)
+        for path, information in zip(others, added, strict=True):
+            for name in information["relative_file_paths"]:
                 os.replace(path / name, first / name)
             shutil.rmtree(path)
             for key in ("relative_file_paths", "files", "topics_with_message_count"):
-                whole[key] += part[key]
-            whole["message_count"] += part["message_count"]
-        files = [each for each in whole["files"] if each["message_count"]]
-        starts = [each["starting_time"]["nanoseconds_since_epoch"] for each in files]
-        ends = [start + each["duration"]["nanoseconds"] for start, each in zip(starts, files, strict=True)]
-        whole["starting_time"] = {"nanoseconds_since_epoch": min(starts)}
-        whole["duration"] = {"nanoseconds": max(ends) - min(starts)}
+                joined[key] += information[key]
+            joined["message_count"] += information["message_count"]
+        files = [file for file in joined["files"] if file["message_count"]]
+        starts = [file["starting_time"]["nanoseconds_since_epoch"] for file in files]
+        ends = [start + file["duration"]["nanoseconds"] for start, file in zip(starts, files, strict=True)]
+        joined["starting_time"] = {"nanoseconds_since_epoch": min(starts)}
+        joined["duration"] = {"nanoseconds": max(ends) - min(starts)}
         (first / "metadata.yaml").write_text(yaml.safe_dump(metadata[0], sort_keys=False), encoding="utf-8")
 
     def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:

@@ -111,7 +111,7 @@ class Assessor:
             navigation = self._estimates.estimators[name].navigation() if fresh else None
         found = doubts(
             self._estimate(name, fresh=fresh),
-            (self._estimate(each.name, fresh=fresh) for each in self._estimates.arm_finders),
+            (self._estimate(arm_finder.name, fresh=fresh) for arm_finder in self._estimates.arm_finders),
             navigation,
             p,
             suggested=suggested is not None,
@@ -123,7 +123,7 @@ class Assessor:
             return found
         held_out = self.so_far(name, fresh=fresh).reasons
         known_to = drift_left_open(self._estimate(name, fresh=fresh), p)
-        return [*found, *objections(navigation, known_to), *(each for each in held_out if each.code in JUDGED_LIVE)]
+        return [*found, *objections(navigation, known_to), *(error for error in held_out if error.code in JUDGED_LIVE)]
 
     def navigation(self, name: str, deviation: GaussianState | None) -> Navigation | None:
         """Return one model's dead-reckoning drift on held-out data; None without reference or motion.
@@ -131,13 +131,12 @@ class Assessor:
         deviation: heading deviation, as `Estimate.heading_deviation`.
         """
         with self._further.settled():
-            own = self._estimates.estimators[name].navigation()
-        if own is not None:
-            return own
-        kept = self._further.recording
-        if kept is None:
+            of_estimator = self._estimates.estimators[name].navigation()
+        if of_estimator is not None:
+            return of_estimator
+        if self._further.recording is None:
             return None
-        recording, epoch_ns = kept
+        recording, epoch_ns = self._further.recording
         try:
             terms = self.held_out_terms(name)
         except np.linalg.LinAlgError:
@@ -145,11 +144,11 @@ class Assessor:
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         # one correction per fold and day, by its index in the flat list
         n_days, p = len(terms[0]), self._estimates.parameters
-        parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
-        corrections = [each for of_days in terms for each in of_days]
+        indices = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
+        corrections = [day_terms for fold_terms in terms for day_terms in fold_terms]
         further = self._further
         return dead_reckoned(
-            recording, parts, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
+            recording, indices, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
         )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
@@ -178,7 +177,9 @@ class Assessor:
 class Estimates:
     """Estimates of a calibrator's models.
 
-    estimators: by model name. further: the estimators beyond the linear filter. models: names of the models in use.
+    estimators: by model name.
+    further: the estimators beyond the linear filter.
+    models: names of the models in use.
     parameters: replaced by the calibrator when parameters change at run time.
     """
 
@@ -189,6 +190,7 @@ class Estimates:
         models: Sequence[str],
         parameters: Parameters,
     ) -> None:
+        """Start without estimates; the arguments are those of the class."""
         self.estimators, self.further, self.parameters = estimators, further, parameters
         self._models = models
         self._day_covariances: dict[str, Array] = {}
@@ -291,101 +293,101 @@ class NonlinearEstimators:
         return iter(self._all)
 
     def _first(self, ask: Callable[[Estimator], _Answer | None]) -> _Answer | None:
-        return next((answer for each in self._all if (answer := ask(each)) is not None), None)
+        return next((answer for estimator in self._all if (answer := ask(estimator)) is not None), None)
 
     @property
     def n_taken(self) -> int:
         """Smallest number of the first aligned row that an estimator has not copied."""
-        return min((each.n_taken for each in self._all), default=NEVER)
+        return min((estimator.n_taken for estimator in self._all), default=NEVER)
 
     @property
     def n_results(self) -> tuple[int, ...]:
         """Counters, by estimator, that grow when it may have new results."""
-        return tuple(each.n_results for each in self._all)
+        return tuple(estimator.n_results for estimator in self._all)
 
     @property
     def affected_from_ns(self) -> int | None:
         """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
-        return min((until for each in self._all if (until := each.affected_from_ns) is not None), default=None)
+        return min((until for model in self._all if (until := model.affected_from_ns) is not None), default=None)
 
     @property
     def reference_claims(self) -> bool:
         """Return whether the reference's noise comes from its messages instead of a parameter."""
-        return any(each.reference_claims for each in self._all)
+        return any(estimator.reference_claims for estimator in self._all)
 
     @property
     def is_level(self) -> bool:
         """Return whether the IMU gives a heading only, so that roll and pitch hold the vehicle's trim."""
-        return any(each.is_level for each in self._all)
+        return any(estimator.is_level for estimator in self._all)
 
     @property
     def arm_effect(self) -> float | None:
         """Velocity error by an unknown arm without turn rates, σ as a share of the speed; None if rates are known."""
-        return self._first(lambda each: each.arm_effect)
+        return self._first(lambda estimator: estimator.arm_effect)
 
     @property
     def is_horizontal(self) -> bool:
         """Return whether no reference measures the vertical."""
-        return any(each.is_horizontal for each in self._all)
+        return any(estimator.is_horizontal for estimator in self._all)
 
     @property
     def are_clocks_known(self) -> bool:
         """Return whether the data determine the clock offsets, zero or not."""
-        return any(each.registration is not None and each.registration.are_known for each in self._all)
+        return any(estimator.registration is not None and estimator.registration.are_known for estimator in self._all)
 
     @property
     def doubt(self) -> Reason | None:
         """Reason against models that assume what these estimators estimate."""
-        return self._first(lambda each: each.doubt)
+        return self._first(lambda estimator: estimator.doubt)
 
     @property
     def suggestion(self) -> Reason | None:
         """Configuration that fits the data, if the given one is grossly wrong."""
-        return self._first(lambda each: each.suggestion)
+        return self._first(lambda estimator: estimator.suggestion)
 
     @property
     def suggestion_so_far(self) -> Reason | None:
         """`suggestion` by the latest evaluation, without waiting."""
-        return self._first(lambda each: each.suggestion_so_far)
+        return self._first(lambda estimator: estimator.suggestion_so_far)
 
     @property
     def registration_so_far(self) -> Registration | None:
         """Registration of clocks and frames by the latest evaluation; None if not known."""
-        return self._first(lambda each: each.registration_so_far)
+        return self._first(lambda estimator: estimator.registration_so_far)
 
     def residuals(self, *, fresh: bool) -> Residuals | None:
         """Return the calibration's residuals, evaluated now if `fresh`, else the latest; None if not available."""
-        return self._first(lambda each: each.residuals(fresh=fresh))
+        return self._first(lambda estimator: estimator.residuals(fresh=fresh))
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
         """Streams kept for verification, and the stamp (ns) of their time 0; None if nothing was kept."""
-        return self._first(lambda each: each.recording)
+        return self._first(lambda estimator: estimator.recording)
 
     @property
     def slow_noise(self) -> SlowNoise | None:
         """Slow errors of reference and attitude as estimated; None if not estimated."""
-        return self._first(lambda each: each.slow_noise)
+        return self._first(lambda estimator: estimator.slow_noise)
 
     @property
     def beam_fault(self) -> BeamFault | None:
         """Most significant fault of one beam of the DVL; None if not tested."""
-        return self._first(lambda each: each.beam_fault)
+        return self._first(lambda estimator: estimator.beam_fault)
 
     @property
     def n_days(self) -> int:
         """Number of days so far."""
-        return max((each.n_days for each in self._all), default=1)
+        return max((estimator.n_days for estimator in self._all), default=1)
 
     def day_of(self, stamps_ns: Stamps) -> Index:
         """Return the day (N,), from 0, of each stamp (ns), for stamps within `recording`."""
-        days = [each.day_of(stamps_ns) for each in self._all]
+        days = [estimator.day_of(stamps_ns) for estimator in self._all]
         return np.max(days, axis=0) if days else np.zeros(len(stamps_ns), dtype=np.intp)
 
     @contextmanager
     def settled(self) -> Iterator[None]:
         """Let all complete blocks take effect inside this context."""
         with ExitStack() as each_settled:
-            for each in self._all:
-                each_settled.enter_context(each.settled())
+            for estimator in self._all:
+                each_settled.enter_context(estimator.settled())
             yield

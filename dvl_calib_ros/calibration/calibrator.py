@@ -63,13 +63,18 @@ _KINDS = {model.name: kind_of(model) for model in MODELS.values() if model.estim
 class Calibrator:
     """Calibration with all models in parallel; the module docstring has the data flow.
 
-    models: names of the models to run; each costs time, and the others have no estimate. prior_sway_heave: prior for
-    ``prior_source: reference`` (m/s), from the caller. initial: initial states by model name. block_size: number of
-    samples gathered before an update, unless a state is requested earlier. on_event: receives a sentence at every
-    restart. on_rows: receives the aligned rows in order, once all models have had them. on_restart: called at a
-    restart, which forgets all samples. verified: keep what hold-out verification needs. trace: filled with the models'
-    states over time. recordings_ns: stamps between recordings; each recording is a day of its own. worker: runs slow
-    work in a thread so that live messages do not wait; None runs it immediately, with the same results.
+    models: names of the models to run; each costs time, and the others have no estimate.
+    prior_sway_heave: prior for ``prior_source: reference`` (m/s), from the caller.
+    initial: initial states by model name.
+    block_size: number of samples gathered before an update, unless a state is requested earlier.
+    on_event: receives a sentence at every restart.
+    on_rows: receives the aligned rows in order, once all models have had them.
+    on_restart: called at a restart, which forgets all samples.
+    verified: keep what hold-out verification needs.
+    trace: filled with the models' states over time.
+    recordings_ns: stamps between recordings; each recording is a day of its own.
+    worker: runs slow work in a thread so that live messages do not wait; None runs it immediately, with the same
+      results.
     """
 
     def __init__(
@@ -88,6 +93,7 @@ class Calibrator:
         worker: Executor | None = None,
         models: Collection[str] = tuple(MODELS),
     ) -> None:
+        """Check the configuration and build the alignment, the filters and the nonlinear estimators."""
         if BROKEN:
             raise ParameterError(BROKEN[0])
         if parameters.prior_source == "reference" and prior_sway_heave is None:
@@ -139,7 +145,7 @@ class Calibrator:
         }
         for name in self._models:
             if MODELS[name].estimator:
-                self._estimators[name] = self._made(MODELS[name])
+                self._estimators[name] = self._new_estimator(MODELS[name])
         # estimators beyond the linear filter
         self._further = NonlinearEstimators([self._estimators[name] for name in self._models if MODELS[name].estimator])
         self._estimates = Estimates(self._estimators, self._further, self._models, self.parameters)
@@ -149,7 +155,7 @@ class Calibrator:
         if self._trace is not None:
             self._trace.start(self._groups)
 
-    def _made(self, model: Model) -> Estimator:
+    def _new_estimator(self, model: Model) -> Estimator:
         """Make the estimator that a model names."""
         together = 1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK)
         setup = EstimatorSetup(
@@ -160,8 +166,8 @@ class Calibrator:
         return _KINDS[model.name](setup)
 
     def _before_clearing(self) -> None:
-        for each in self._further:
-            each.advance()
+        for estimator in self._further:
+            estimator.advance()
 
     def _restart(self, back_s: float) -> None:
         """Restart after a clock step, by `back_s` backward (s), negative if forward."""
@@ -203,8 +209,8 @@ class Calibrator:
 
     def feed_fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
         """Take a position (3,) m of the reference point, ENU from any origin, and variances (3,) m², nan if unknown."""
-        for each in self._further:
-            each.take_fix(stamp_ns, position, variance)
+        for estimator in self._further:
+            estimator.take_fix(stamp_ns, position, variance)
 
     def refuse(self, stream: str, reason: str) -> None:
         """Count a message of a stream (dvl, reference, imu) that is no valid sample, under its reason."""
@@ -213,10 +219,10 @@ class Calibrator:
     def _advance(self) -> None:
         """Pass new pairings to the selection, and update the models that have enough samples."""
         aligner = self._aligner
-        for each in self._further:
-            if aligner.partners.n_judged - each.n_taken >= COPIED_AT_ONCE:
-                each.take_rows()
-            each.advance()
+        for estimator in self._further:
+            if aligner.partners.n_judged - estimator.n_taken >= COPIED_AT_ONCE:
+                estimator.take_rows()
+            estimator.advance()
         if aligner.partners.n_paired > self._n_selected:
             self._select()
         due = [group for group in self._groups if self._is_due(group)]
@@ -318,8 +324,8 @@ class Calibrator:
 
     def finish(self) -> None:
         """Update all models with the decided rows, and give all remaining rows to on_rows."""
-        for each in self._further:
-            each.finish()
+        for estimator in self._further:
+            estimator.finish()
         for group in self._groups:
             self._update(group)
         rows = self._aligner.rows
@@ -371,8 +377,8 @@ class Calibrator:
     def selection(self) -> Selection:
         """Model selection over time."""
         if self._worker is None:  # with a worker nothing is gathered, and other threads may read
-            for each in self._further:
-                each.settle()
+            for estimator in self._further:
+                estimator.settle()
             self._select()
         return self._selection
 
@@ -475,8 +481,8 @@ class Calibrator:
         if self._worker is None:
             return {}
         verification = self._judge.so_far(self.selected, fresh=True)
-        known = {each.code for each in verification.reasons}
-        against = [each for each in doubts if each.severity is not Severity.WARNING and each.code not in known]
+        known = {reason.code for reason in verification.reasons}
+        against = [doubt for doubt in doubts if doubt.severity is not Severity.WARNING and doubt.code not in known]
         return {self.selected: verification.with_objections(against)}
 
     @property
@@ -495,7 +501,7 @@ class Calibrator:
     def doubts_so_far(self) -> Sequence[Reason]:
         """`doubts` by the latest evaluation, recomputed (some milliseconds) only when its inputs have changed."""
         clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_results
-        of = (self.selected, *self._further.n_results, *(each.code for each in clocks))
+        of = (self.selected, *self._further.n_results, *(clock.code for clock in clocks))
         if self._doubted is None or self._doubted[0] != of:
             self._doubted = of, self._judge.doubts(self.selected, clocks, fresh=False)
         return self._doubted[1]

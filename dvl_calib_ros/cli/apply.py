@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rollback",
         action="store_true",
-        help="restore the files from before the last apply; a second time undoes that",
+        help="restore the files from before the last apply; a second --rollback undoes this",
     )
 
 

@@ -120,7 +120,7 @@ def add_storage_options(parser: argparse.ArgumentParser) -> None:
     storages, compressions = [each.value for each in Storage], [each.value for each in Compression]
     parser.add_argument("--storage", choices=storages, default="mcap", help="default: %(default)s")
     parser.add_argument(
-        "--compression", choices=compressions, default="none", help="chunk is MCAP's own; default: %(default)s"
+        "--compression", choices=compressions, default="none", help="chunk only for mcap; default: %(default)s"
     )
 
 

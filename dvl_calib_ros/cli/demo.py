@@ -150,7 +150,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     model = load_yaml(saved, "result file")["model"]
     start_ns = offline.first_ns or 0
     switches = ", ".join(f"{(at - start_ns) * 1e-9:.1f} s {name}" for at, name in offline.segments)
-    out.print(f"The node ended on {model}, the replay on {offline.selected}; auto ran, by stamps: {switches}.")
+    out.print(f"The node ended on {model}, the replay on {offline.selected}; auto selected, by stamp: {switches}.")
     verdict = "agree" if worst < 1e-12 else "[red]DIFFER[/] (if the machine is too busy to keep up: --speed 5)"
     out.print(f"Live and offline {verdict}: the largest difference in any state or covariance is {worst:.1e}.")
     return worst < 1e-12

@@ -175,7 +175,7 @@ def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
     """Add --simulator and its further options."""
     parser.add_argument(
         "--simulator", nargs="+", type=Path, metavar="SIM",
-        help="bags of a simulator, from any motion, with its true velocity: what does its DVL lack?",
+        help="bags of a simulator, of any motion and with its true velocity: report what its DVL lacks",
     )  # fmt: skip
     parser.add_argument(
         "--simulator-params", type=Path, metavar="FILE", help="parameter file of the simulator, if it differs"

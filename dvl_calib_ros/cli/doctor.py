@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument(
         "--live", nargs="?", type=float, const=LIVE_S, metavar="S",
-        help="instead of a bag, the current ROS 2 topics, for S seconds; without a number: %(const)g",
+        help="examine the current ROS 2 topics for S seconds, not a bag; without a number: %(const)g",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)

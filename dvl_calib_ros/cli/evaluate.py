@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="noise seeds 0 .. N - 1; default: %(default)s"
     )
-    parser.add_argument("--sets", default="all", help="such as E1,E2; default: all")
-    parser.add_argument("--models", default="all", help="such as M3,M7; default: all")
+    parser.add_argument("--sets", default="all", help="sets, such as E1,E2; default: all")
+    parser.add_argument("--models", default="all", help="models, such as M3,M7; default: all")
     parser.add_argument("--partial", action="store_true", help="go on although trajectories are missing in the folder")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was found as JSON")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every Avg.VRMSE as CSV, one per line")
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Evaluate, print, save."""
+    """Run the evaluation or the cross-check, print its document, and write the requested files."""
     from ..calibration.models import BY_VELOCITY
     from ..disk.atomic import save_text
     from ..evaluation.documents import evaluation_csv, evaluation_document

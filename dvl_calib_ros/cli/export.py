@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Read, write both files, print."""
+    """Write the settings for the simulator and the list of what is missing, and print a summary."""
     from ..simulator_export.registry import missing_beside, write_settings
 
     missing = missing_beside(arguments.output)

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write (for a folder: folder of bags)")
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="reference velocities, or a receiver's NMEA (RMC)")
     parser.add_argument("--attitude", type=Path, metavar="FILE", help="roll, pitch, yaw in north-east-down")
-    parser.add_argument("--frame", choices=("frd", "flu"), default="frd", help="of the DVL; default: %(default)s")
+    parser.add_argument("--frame", choices=("frd", "flu"), default="frd", help="axes of the DVL; default: %(default)s")
     frames = ("frd", "flu", "enu", "ned")
     parser.add_argument("--gnss-frame", choices=frames, default="frd", help="default: %(default)s")
     parser.add_argument(
@@ -47,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MAP",
         help="columns of a DVL's table: time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME",
     )
-    parser.add_argument("--dvl-std", type=float, default=0.0, metavar="M/S", help="covariance to write; 0: not given")
-    parser.add_argument("--gnss-std", type=float, default=0.0, metavar="M/S", help="covariance to write; 0: not given")
+    parser.add_argument("--dvl-std", type=float, default=0.0, metavar="M/S", help="σ to write as covariance; 0: none")
+    parser.add_argument("--gnss-std", type=float, default=0.0, metavar="M/S", help="σ to write as covariance; 0: none")
     parser.add_argument(
         "--start", type=float, default=1_600_000_000.0, metavar="S", help="stamp of time 0, s since 1970; default 1.6e9"
     )

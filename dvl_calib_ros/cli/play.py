@@ -32,16 +32,16 @@ CLOCKS_HZ = (0.1, 1000.0)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag file")
-    parser.add_argument("-r", "--rate", type=float, default=1.0, help="times as fast as recorded; default: %(default)g")
-    parser.add_argument("-l", "--loop", action="store_true", help="again and again, until Ctrl-C")
+    parser.add_argument("-r", "--rate", type=float, default=1.0, help="multiple of real time; default: %(default)g")
+    parser.add_argument("-l", "--loop", action="store_true", help="repeat until Ctrl-C")
     parser.add_argument(
-        "-d", "--delay", type=float, default=0.0, metavar="S", help="wait so long before the first message"
+        "-d", "--delay", type=float, default=0.0, metavar="S", help="wait S seconds before the first message"
     )
     parser.add_argument("--start-offset", type=float, default=0.0, metavar="S", help="begin S seconds into the bag")
     parser.add_argument(
         "--playback-duration", type=float, default=float("inf"), metavar="S", help="play S seconds of the bag"
     )
-    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these")
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play only these topics")
     parser.add_argument(
         "-m", "--remap", nargs="+", default=[], metavar="OLD:=NEW", help="publish a topic by another name"
     )

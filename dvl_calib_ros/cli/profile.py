@@ -20,8 +20,8 @@ def add_option(parser: argparse.ArgumentParser) -> None:
     """Add --profile."""
     parser.add_argument(
         "--profile", metavar="NAME",
-        help=f"stored topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file; default: {IN_FOLDER} of this "
-        "folder; none: without",
+        help="profile of topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file, or none for no profile; "
+        f"default: {IN_FOLDER} of this folder",
     )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--waves", nargs=2, type=float, metavar=("HEIGHT", "PERIOD"),
         help="surface waves: significant height (m), period of the peak (s)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of all random numbers; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random numbers; default: %(default)s")
     parser.add_argument(
         "--effect", action="append", default=[], metavar=FORM,
         help="add an effect, such as lever_arm:x_m=0.3; repeatable (dvl-calib parameters --effects lists them)",
@@ -66,10 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--misalignment", nargs=3, type=float, default=none, metavar=angles,
         help="rotation of the DVL from its nominal mounting, degrees",
     )  # fmt: skip
-    parser.add_argument("--scale", nargs="+", type=float, default=[0.0], metavar="PERCENT", help="one, or one per axis")
+    scale_help = "scale error: one number, or one per axis"
+    parser.add_argument("--scale", nargs="+", type=float, default=[0.0], metavar="PERCENT", help=scale_help)
     parser.add_argument(
         "--mounting-rpy", nargs=3, type=float, default=none, metavar=angles,
-        help="nominal mounting, rad, as the parameter",
+        help="nominal mounting, rad, as parameter mounting_rpy",
     )  # fmt: skip
     parser.add_argument("--dvl-rate", type=float, default=5.0, metavar="HZ", help="default: %(default)g")
     parser.add_argument("--gnss-rate", type=float, default=5.0, metavar="HZ", help="default: %(default)g; 0: no GNSS")
@@ -229,11 +230,11 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
         help="nav_msgs/Odometry of a vehicle driven elsewhere, such as in another simulator; until Ctrl-C",
     )  # fmt: skip
     live.add_argument(
-        "--speed", type=float, default=1.0, help="times real time, without --follow; default: %(default)g"
+        "--speed", type=float, default=1.0, help="multiple of real time, without --follow; default: %(default)g"
     )
     live.add_argument("--wait", action="store_true", help="begin when DVL, GNSS and IMU have a subscriber each")
     live.add_argument(
-        "--dvl-type", default=TWIST_TYPE, metavar="TYPE", help="of the DVL's messages; default: %(default)s"
+        "--dvl-type", default=TWIST_TYPE, metavar="TYPE", help="type of the DVL's messages; default: %(default)s"
     )
     common.add_topic_options(live)
     live.add_argument("--ros-args", nargs=argparse.REMAINDER, default=[], dest="ros_args", help=argparse.SUPPRESS)

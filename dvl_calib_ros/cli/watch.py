@@ -181,7 +181,10 @@ class Row(NamedTuple):
 class View:
     """Live view, fitted to the terminal: rows with fixed places first, optional rows last.
 
-    now_s: monotonic time. log: lines of the node's log. event: the last answer or log line. page: presses of w.
+    now_s: monotonic time.
+    log: lines of the node's log.
+    event: the last answer or log line.
+    page: presses of w.
     """
 
     status: Status | None

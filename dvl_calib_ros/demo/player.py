@@ -54,6 +54,7 @@ class BagPlayer:
         reliability: Any = ReliabilityPolicy.RELIABLE,
         clock_hz: float = 0.0,
     ) -> None:
+        """Create a publisher for each topic to play. reliability: QoS policy of the publishers."""
         self._paths = paths
         self._reliable = reliability == ReliabilityPolicy.RELIABLE
         self._publishers: dict[str, Any] = {}
@@ -83,7 +84,7 @@ class BagPlayer:
     def unheard(self) -> list[str]:
         """Published topics without a subscriber."""
         publishers = (*self._publishers.values(), *self._description)
-        return [each.topic_name for each in publishers if each.get_subscription_count() < 1]
+        return [publisher.topic_name for publisher in publishers if publisher.get_subscription_count() < 1]
 
     def wait_for_subscribers(self, timeout_s: float = 30.0) -> None:
         """Wait until every publisher has a subscriber. Raises InputError after `timeout_s`."""

@@ -45,6 +45,7 @@ class Watcher:
     """Player of bags to the node, with the node's answers for `render`. truth: in degrees and per cent."""
 
     def __init__(self, paths: Sequence[Path], truth: Mapping[str, float]) -> None:
+        """Subscribe to the answers of the node, and create the publishers of the bags."""
         self._truth = truth
         self._node = AnsweringNode("dvl_calib_demo")
         latched = QoSProfile(

@@ -105,17 +105,18 @@ def sign_findings(
 
     axes_are_given: the user has set dvl_axes, which confirms all signs.
     """
-    looks = [(each.looks[topics.dvl], each.looks.get(topics.imu)) for each in recordings if topics.dvl in each.looks]
-    if not looks:
+    surveyed = [survey.previews for survey in recordings if topics.dvl in survey.previews]
+    if not surveyed:
         return
-    first = looks[0][0]
+    first = surveyed[0][topics.dvl]
     is_turned = turns_dvl(VELOCITY_TYPES[first.msgtype], first.frame_id, parameters)
     flu_from_dvl = FLU_FROM_FRD if is_turned else np.eye(3)
     body_from_message = parameters.rotation_dvl_from_body.T @ flu_from_dvl
     frame = ImuFrame(rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, "")
     sway_signs, directions = [], Directions()
-    for dvl, imu in looks:
-        imu = in_time_of(dvl, imu, parameters)
+    for previews in surveyed:
+        dvl = previews[topics.dvl]
+        imu = in_time_of(dvl, previews.get(topics.imu), parameters)
         if imu is not None and imu.has_orientation:
             velocity, read = dvl.values @ body_from_message.T, frame.read(imu_columns_of(imu))
             sway_signs.append(sway_sign(dvl.stamps_s, velocity, read))
@@ -124,14 +125,14 @@ def sign_findings(
     if directions.turn_with_heading:
         yield finding("DVL_TURNS_WITH_HEADING")
         return
-    mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in looks]).mean(axis=0)
-    mean_velocity = body_from_message @ mean
+    velocities = np.concatenate([previews[topics.dvl].values for previews in surveyed])
+    mean_velocity = body_from_message @ velocities[np.isfinite(velocities).all(axis=1)].mean(axis=0)
     ahead = np.array([mean_velocity[0], 0.0, 0.0])
     if math.hypot(mean_velocity[1], mean_velocity[2]) >= math.tan(LIKELY) * abs(mean_velocity[0]):
         return  # no vehicle that travels ahead
-    signs = [each for each in sway_signs if each is not None and each.sign]
+    signs = [found for found in sway_signs if found is not None and found.sign]
     axes, other = (FRD, FLU) if is_turned != parameters.is_z_down else (FLU, FRD)
-    if signs and all(each.sign < 0 for each in signs):
+    if signs and all(sign.sign < 0 for sign in signs):
         yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=other)
         return
     if axes_are_given:
@@ -140,7 +141,7 @@ def sign_findings(
     for row in (2,) if signs else (1, 2):
         # the axis most along this row of the body; negated, the mirrored mounting fits as well
         shares = np.abs(body_from_message[row]).round(6)
-        axis = max(range(3), key=lambda sway_signs: (shares[sway_signs], sway_signs == row))
+        axis = max(range(3), key=lambda column: (shares[column], column == row))
         mirrored = flips[row][:, None] * fitted * flips[axis]
         change, addition = angle_between(fitted, mirrored), ""
         if change < SAME_ANSWER:

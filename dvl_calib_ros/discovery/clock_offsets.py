@@ -25,7 +25,7 @@ from ..calibration.streams.interpolation import ImuColumns
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
-from ..recordings.topic_preview import Look, Survey
+from ..recordings.topic_preview import Preview, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason
 
@@ -44,8 +44,9 @@ COMPARED = 1500
 class FoundClocks:
     """Clock offsets of the streams.
 
-    offsets: by parameter, value to subtract, s, in addition to the configured one. far: clocks with offsets too large
-    to be registered. parameters: the frames used.
+    offsets: by parameter, value to subtract, s, in addition to the configured one.
+    far: clocks with offsets too large to be registered.
+    parameters: the frames used.
     """
 
     registration: Registration
@@ -95,7 +96,7 @@ def find_clocks(
     """
     if topics.gnss not in recording.columns or topics.dvl not in recording.columns:
         return None
-    found = [_find_in_recording(each, topics, parameters, knows_mounting, given) for each in recording.each]
+    found = [_find_in_recording(part, topics, parameters, knows_mounting, given) for part in recording.each]
     first = found[0]
     if len(found) > 1 and any(clocks is not None and clocks.offsets.keys() & MOVING for clocks in found):
         return None  # drift or step differ between recordings
@@ -140,10 +141,10 @@ def _find_in_recording(
     return FoundClocks(registration, offsets, hypothesis)
 
 
-def _residual_without_noise(found: Registration, motion: MotionStreams) -> float:
+def _residual_without_noise(registration: Registration, motion: MotionStreams) -> float:
     """Return the residual of a registration without the reference's noise, as a share of the speed."""
-    noise = 3.0 * white_noise(motion.reference) / max(found.speed, 1e-9) ** 2
-    return math.sqrt(max(found.residual**2 - noise, 0.0))
+    noise = 3.0 * white_noise(motion.reference) / max(registration.speed, 1e-9) ** 2
+    return math.sqrt(max(registration.residual**2 - noise, 0.0))
 
 
 def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Parameters]:
@@ -176,28 +177,28 @@ def _one_per_interval(block: SampleBlock) -> SampleBlock:
     return block.part(np.flatnonzero(np.diff(bins, prepend=-1)))
 
 
-def on_imu_clock(recording: Recording, topics: Topics, found: Registration) -> Survey:
+def on_imu_clock(recording: Recording, topics: Topics, registration: Registration) -> Survey:
     """Return the previewed streams with their stamps corrected to the IMU's clock by a registration."""
     survey = recording.whole(topics)
-    delays_s = {topics.dvl: found.dvl.delay_s, topics.gnss: found.reference.delay_s}
-    if not found.is_turned:  # without turns only the delay between DVL and reference is observable
-        delays_s = {topics.dvl: found.apart.delay_s}
-    looks = {
-        name: replace(look, stamps_s=look.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
-        for name, look in survey.looks.items()
+    delays_s = {topics.dvl: registration.dvl.delay_s, topics.gnss: registration.reference.delay_s}
+    if not registration.is_turned:  # without turns only the delay between DVL and reference is observable
+        delays_s = {topics.dvl: registration.apart.delay_s}
+    previews = {
+        name: replace(preview, stamps_s=preview.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
+        for name, preview in survey.previews.items()
     }
-    if topics.dvl in looks:
-        looks[topics.dvl] = _thinned(looks[topics.dvl])
-    return replace(survey, looks=looks)
+    if topics.dvl in previews:
+        previews[topics.dvl] = _thinned(previews[topics.dvl])
+    return replace(survey, previews=previews)
 
 
-def _thinned(look: Look) -> Look:
-    step = -(-len(look.stamps_s) // COMPARED)
-    rates, pose = (None if each is None else each[::step] for each in (look.rates, look.pose))
-    return replace(look, stamps_s=look.stamps_s[::step], values=look.values[::step], rates=rates, pose=pose)
+def _thinned(preview: Preview) -> Preview:
+    step = -(-len(preview.stamps_s) // COMPARED)
+    rates, pose = (None if column is None else column[::step] for column in (preview.rates, preview.pose))
+    return replace(preview, stamps_s=preview.stamps_s[::step], values=preview.values[::step], rates=rates, pose=pose)
 
 
-def difference_of(dvl: Look, reference: Look) -> float | None:
+def difference_of(dvl: Preview, reference: Preview) -> float | None:
     """Return the residual of two velocities after the best rotation, both taken in the body frame."""
     motion = compared_motion(dvl, reference, None)
     if motion is None:
@@ -206,17 +207,17 @@ def difference_of(dvl: Look, reference: Look) -> float | None:
     return found[0].best_residual if found else None
 
 
-def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:
+def compared_motion(dvl: Preview, reference: Preview, imu: Preview | None) -> MotionStreams | None:
     """Return the previewed samples as motion streams, in the messages' own axes; None if there are too few."""
     columns = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
     if imu is not None and imu.has_orientation:
         columns = imu_columns_of(imu)
     measured = True, True, bool(reference.values[:, 2].any())
-    dvl_motion, reference_motion = (in_order(each.stamps_s, each.values) for each in (dvl, reference))
+    dvl_motion, reference_motion = (in_order(preview.stamps_s, preview.values) for preview in (dvl, reference))
     return make_motion(dvl_motion, reference_motion, False, measured, columns)
 
 
-def imu_columns_of(imu: Look) -> ImuColumns:
+def imu_columns_of(imu: Preview) -> ImuColumns:
     """Return orientation and angular velocity of an IMU's topic as columns."""
     times, values = in_order(imu.stamps_s, imu.values)
     return ImuColumns(times, unit_quaternions(values[:, :4]), values[:, 4:7])

@@ -32,7 +32,7 @@ from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recording import Recording, open_recording
-from ..recordings.topic_preview import Look, Survey
+from ..recordings.topic_preview import Preview, Survey
 from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
@@ -73,7 +73,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
     if found.topics.gnss not in recording.types and not found.contradictions:
-        surveys = [one.whole(found.topics) for one in recording.each]
+        surveys = [part.whole(found.topics) for part in recording.each]
         signs = sign_findings(surveys, found.topics, found.parameters, "dvl_axes" in named.parameters)
         return replace(found, contradictions=tuple(signs))
     clocks = clocks_of_recording(recording, found, named)
@@ -106,6 +106,7 @@ class _Search:
     """One search; the findings are collected in attributes."""
 
     def __init__(self, survey: Survey, parameters: Parameters, given: Given, where: str) -> None:
+        """Read the transforms. given: what the user set. where: name of the recording in messages."""
         self._survey, self._parameters, self._given, self._where = survey, parameters, given, where
         used = parameters.use_transforms
         self._tree = FrameTree.of(survey.transforms if used else (), survey.descriptions if used else ())
@@ -120,10 +121,10 @@ class _Search:
     def run(self) -> Discovery:
         """Choose topics, then the frames of the DVL, if it has data."""
         topics = self._choose_topics()
-        looks = self._survey.looks
-        dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
+        previews = self._survey.previews
+        dvl, reference, imu = previews.get(topics.dvl), previews.get(topics.gnss), previews.get(topics.imu)
         if dvl is not None:
-            self._choose_frames(dvl, *(in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
+            self._choose_frames(dvl, *(in_time_of(dvl, preview, self._parameters) for preview in (reference, imu)))
         self._found.insert(0, self._describe_topics(topics))
         return Discovery(
             topics,
@@ -179,12 +180,12 @@ class _Search:
             if kind is None:
                 parts.append(f"no {role}")
                 continue
-            look = self._survey.looks.get(name)
-            rate = f", {look.rate_hz:.3g} Hz" if look is not None and look.rate_hz else ""
+            preview = self._survey.previews.get(name)
+            rate = f", {preview.rate_hz:.3g} Hz" if preview is not None and preview.rate_hz else ""
             frame = ""
-            if role == "reference" and look is not None:
+            if role == "reference" and preview is not None:
                 chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame
-                declared = self._declared_reference(look)
+                declared = self._declared_reference(preview)
                 if chosen == FROM_FRAME_ID:
                     chosen = "" if declared is None else declared.name
                 frame = f", {chosen}" if chosen else ""
@@ -194,7 +195,7 @@ class _Search:
     def _is_given(self, name: str) -> bool:
         return name in self._given.parameters
 
-    def _choose_frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
+    def _choose_frames(self, dvl: Preview, reference: Preview | None, imu: Preview | None) -> None:
         """Choose mounting, axes and frames from transforms, motion and gravity; note what was found."""
         placed = self._place_dvl(dvl)
         mounting = self._parameters.rotation_dvl_from_body.T if self._is_given("mounting_rpy") else None
@@ -248,7 +249,7 @@ class _Search:
             self._use_claimed_heading(imu)
             self._check_gravity(imu)
 
-    def _lower_min_speed(self, dvl: Look) -> None:
+    def _lower_min_speed(self, dvl: Preview) -> None:
         """Set min_speed of a vehicle that mostly moves more slowly than the default."""
         speed = np.linalg.norm(dvl.values, axis=1)
         moving = speed[speed > SLOWEST_MPS]
@@ -275,7 +276,7 @@ class _Search:
                 "lever arm are in these axes (base_axes frd)"
             )
 
-    def _check_gravity(self, imu: Look) -> None:
+    def _check_gravity(self, imu: Preview) -> None:
         """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
         gravity, parameters = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
         if gravity is not None and (
@@ -285,7 +286,7 @@ class _Search:
         ):
             self._contradictions.append(found)
 
-    def _use_claimed_heading(self, imu: Look) -> None:
+    def _use_claimed_heading(self, imu: Preview) -> None:
         """Set the heading accuracy that the IMU claims."""
         std = believed_heading(imu.claimed_std)
         if self._is_given("heading_deviation_std") or std is None:
@@ -296,7 +297,7 @@ class _Search:
             f"(-p heading_deviation_std:={std:.2g})"
         )
 
-    def _set_position(self, placed: Placed | None, reference: Look | None) -> None:
+    def _set_position(self, placed: Placed | None, reference: Preview | None) -> None:
         """Set the knowledge about the DVL's position in the body, which needs more than the lever arm."""
         if self._is_given("dvl_position"):
             return
@@ -311,7 +312,7 @@ class _Search:
         elif is_known:
             self._values["dvl_position"] = TOLD
 
-    def _known_reference_position(self, reference: Look) -> Array | None:
+    def _known_reference_position(self, reference: Preview) -> Array | None:
         """Return the position of the reference point in the body; None if unknown."""
         placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
         if placed is not None and _is_located(placed):
@@ -322,7 +323,7 @@ class _Search:
         says_body = named is not None and named.frame is VelocityFrame.BODY
         return np.zeros(3) if in_body and says_body else None
 
-    def _place_dvl(self, dvl: Look) -> Placed | None:
+    def _place_dvl(self, dvl: Preview) -> Placed | None:
         """Return the DVL's mounting by transforms; with an unknown frame, by a frame whose name indicates a DVL."""
         base_frame = self._parameters.base_frame
         frame = self._parameters.dvl_frame or dvl.frame_id
@@ -331,7 +332,7 @@ class _Search:
             self._contradictions.append(finding("DVL_FRAME_NOT_OWN", topic=dvl.topic, frame=dvl.frame_id))
         placed = self._tree.placed(frame, base_frame)
         if placed is None and not self._is_body_or_earth(frame):
-            likely_frame = self._tree.likely(topic_choice.DVL_WORDS)
+            likely_frame = self._tree.only_named_like(topic_choice.DVL_WORDS)
             placed = None if likely_frame is None else self._tree.placed(likely_frame, base_frame)
             if placed is not None:
                 self._notes.append(finding("FRAME_NOT_IN_TREE", frame=frame, other=placed.frame))
@@ -347,11 +348,11 @@ class _Search:
         name = frame_id.strip("/")
         return name == self._parameters.base_frame.strip("/") or name.lower() in EARTH_FRAMES
 
-    def _declared_reference(self, reference: Look) -> DeclaredFrame | None:
+    def _declared_reference(self, reference: Preview) -> DeclaredFrame | None:
         base = self._values.get("base_frame", self._parameters.base_frame)
         return declared_reference(reference, self._parameters, base)
 
-    def _reference_frame(self, reference: Look | None) -> VelocityFrame | None:
+    def _reference_frame(self, reference: Preview | None) -> VelocityFrame | None:
         """Return the assumed frame of the reference; None without one, or if unknown."""
         if reference is None:
             return None
@@ -359,7 +360,7 @@ class _Search:
         declared = self._declared_reference(reference) if chosen_name is None else DECLARED_FRAMES[chosen_name]
         return None if declared is None else declared.frame
 
-    def _knows_imu(self, imu: Look | None) -> bool:
+    def _knows_imu(self, imu: Preview | None) -> bool:
         """Return whether the IMU's orientation in the body is known: by a transform, or DVL and reference agree."""
         if imu is None:
             return False
@@ -372,23 +373,29 @@ class _Search:
     def _fit(
         self,
         frames: FrameChooser,
-        dvl: Look,
-        reference: Look,
-        imu: Look | None,
-        known: Array | None,
+        dvl: Preview,
+        reference: Preview,
+        imu: Preview | None,
+        mounting: Array | None,
         placed: Placed | None,
     ) -> FrameChoice | None:
-        """Choose the frames under which DVL and reference agree best; None without common motion."""
+        """Choose the frames under which DVL and reference agree best; None without common motion.
+
+        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
+        """
         position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
         motion = compared_motion(dvl, reference, imu)
         if motion is None:
             return None
         self._readings = Readings(motion, position)
         is_known = _is_located(placed) and self._known_reference_position(reference) is not None
-        return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
+        return frames.choose(self._readings, reference, None if mounting is None else mounting.T, is_known)
 
-    def _use_reading(self, chosen: Agreement, known: Array | None, reference: Look, imu: Look | None) -> None:
-        """Write the frames and mounting of a reading into the parameters."""
+    def _use_reading(self, chosen: Agreement, mounting: Array | None, reference: Preview, imu: Preview | None) -> None:
+        """Write the frames and mounting of a reading into the parameters.
+
+        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
+        """
         reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)
         if declared is not None:
@@ -409,7 +416,7 @@ class _Search:
                 self._contradictions.append(finding("REFERENCE_FRAME_OTHER", topic=reference.topic, **frame))
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
-        if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < MAX_RESIDUAL:
+        if mounting is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < MAX_RESIDUAL:
             residual = self._readings.registered(reading, np.eye(3)).residual
             turned_residual, rotation, *_ = self._readings.registered(reading, None)
             if self._readings.without_noise(turned_residual) < BETTER_BY * self._readings.without_noise(residual):
@@ -421,8 +428,11 @@ class _Search:
                 level_residual, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
                 self._mounting_found(level if BETTER * level_residual <= turned_residual else rpy, why)
 
-    def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
-        """Set the noise of a reference that claims none, far too little, or more than its velocities show."""
+    def _measure_noise(self, chosen: Agreement, mounting: Array | None, dvl: Preview, reference: Preview) -> None:
+        """Set the noise of a reference that claims none, far too little, or more than its velocities show.
+
+        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
+        """
         if self._is_given("gnss_aided_std") or self._is_given("use_message_covariance"):
             return
         says_nothing = "use_message_covariance" in self._values
@@ -443,7 +453,7 @@ class _Search:
             too_little or claims_none or says_nothing or (may_claim_less and most > max(least * per_axis, QUIETEST))
         ):
             return
-        best, *_ = self._readings.registered(chosen.reading, None if known is None else known.T)
+        best, *_ = self._readings.registered(chosen.reading, None if mounting is None else mounting.T)
         noise = max(max(min(best, chosen.best_residual), least) * per_axis, QUIETEST)
         too_much = may_claim_less and most > noise
         if not (too_much or too_little or claims_none or says_nothing):
@@ -476,10 +486,10 @@ class _Search:
         self._mounting_because = why
         self._notes.append(mounting_guessed(rpy, why))
 
-    def _mounting_from_motion(self, dvl: Look, turned: bool, known: Array | None) -> None:
+    def _mounting_from_motion(self, dvl: Preview, turned: bool, mounting: Array | None) -> None:
         """Guess the mounting without a reference, assuming a vehicle that drives ahead, as the models without GNSS do.
 
-        known: rotation_body_from_dvl (3, 3), None if unknown.
+        mounting: rotation_body_from_dvl (3, 3), None if unknown.
         """
         velocity = dvl.values @ FLU_FROM_FRD if turned else dvl.values
         if not len(velocity):
@@ -490,23 +500,23 @@ class _Search:
         ahead = np.tile([np.linalg.norm(mean), 0.0, 0.0], (2, 1))
         rotation_dvl_from_body = best_rotation(np.tile(mean, (2, 1)), ahead, np.eye(3))
         yaw = math.atan2(rotation_dvl_from_body[0, 1], rotation_dvl_from_body[0, 0])
-        if known is not None:
-            ahead_in_body = known @ mean
+        if mounting is not None:
+            ahead_in_body = mounting @ mean
             is_sideways = abs(ahead_in_body[1]) > abs(ahead_in_body[0])
             if (is_sideways or ahead_in_body[0] < 0.0) and not self._is_given("mounting_rpy"):
-                given, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
-                fields = {"given": in_degrees(given), "found": in_degrees(fits), "option": as_option(fits)}
+                configured, fits = rpy_from_rotation(mounting) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
+                fields = {"given": in_degrees(configured), "found": in_degrees(fits), "option": as_option(fits)}
                 code = "TRAVELS_SIDEWAYS" if is_sideways else "TRAVELS_ASTERN"
-                self._contradictions.append(finding(code, also=_other_axes(known, mean), **fields))
+                self._contradictions.append(finding(code, also=_other_axes(mounting, mean), **fields))
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 
-    def _reference_position(self, reference: Look) -> Array:
+    def _reference_position(self, reference: Preview) -> Array:
         """Return the position in the body of the point whose velocity the reference measures."""
         placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
         return np.zeros(3) if placed is None else placed.position
 
-    def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
+    def _place_lever_arm(self, placed: Placed, reference: Preview | None) -> None:
         """Set the lever arm by the transforms, from the reference's position; note the source."""
         given_mounting = self._is_given("mounting_rpy")
         parts = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]

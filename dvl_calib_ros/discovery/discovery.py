@@ -12,7 +12,7 @@ from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.clock_domains import limit_s
 from ..calibration.registration.frame_hypotheses import Agreement
 from ..recordings.recording import Recording
-from ..recordings.topic_preview import Look
+from ..recordings.topic_preview import Preview
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import FoundClocks, find_clocks
@@ -33,11 +33,15 @@ class Given:
 class Discovery:
     """Discovered configuration.
 
-    found: findings with their sources, in sentences. notes: skipped alternatives. contradictions: contradictions
-    between the recording's data and its declarations. values: discovered parameters, which are included in
-    `parameters`. agreement: of DVL and reference, None if it could not be computed. reference_frame: assumed frame of
-    the reference. knows_imu: whether the IMU's axes are known. mounting_because: reason for a mounting guessed from the
-    data; else ''. clocks_given: clock parameters before the offsets in `parameters` were added.
+    found: findings with their sources, in sentences.
+    notes: skipped alternatives.
+    contradictions: contradictions between the recording's data and its declarations.
+    values: discovered parameters, which are included in `parameters`.
+    agreement: of DVL and reference, None if it could not be computed.
+    reference_frame: assumed frame of the reference.
+    knows_imu: whether the IMU's axes are known.
+    mounting_because: reason for a mounting guessed from the data; else ''.
+    clocks_given: clock parameters before the offsets in `parameters` were added.
     """
 
     topics: Topics
@@ -74,7 +78,7 @@ class Discovery:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Warnings for the user."""
-        return tuple(each.sentence for each in (*self.contradictions, *self.notes))
+        return tuple(reason.sentence for reason in (*self.contradictions, *self.notes))
 
     def document(self) -> dict[str, Any]:
         """Return plain data for JSON: topics, findings, warnings."""
@@ -83,8 +87,8 @@ class Discovery:
             "topics": topics,
             "found": list(self.found),
             "doubts": list(self.doubts),
-            "contradictions": [each.as_dict() for each in self.contradictions],
-            "notes": [each.as_dict() for each in self.notes],
+            "contradictions": [contradiction.as_dict() for contradiction in self.contradictions],
+            "notes": [note.as_dict() for note in self.notes],
         }
 
 
@@ -106,7 +110,7 @@ def clocks_of_recording(recording: Recording, found: Discovery, given: Given) ->
     return find_clocks(recording, found.topics, found.parameters, knows_mounting=knows_mounting, given=given.parameters)
 
 
-def in_time_of(dvl: Look, other: Look | None, parameters: Parameters) -> Look | None:
+def in_time_of(dvl: Preview, other: Preview | None, parameters: Parameters) -> Preview | None:
     """Shift stamps to the DVL's clock if the offset exceeds any delay that is estimated.
 
     Velocities of different times agree only in wrong frames. The replay reports the clock offset.

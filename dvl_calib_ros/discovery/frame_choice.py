@@ -40,7 +40,7 @@ from ..calibration.streams.imu_frame import ENU_FROM
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import DECLARED_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.topic_preview import Look
+from ..recordings.topic_preview import Preview
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import imu_columns_of
 from .discovery import as_option
@@ -91,8 +91,9 @@ POSE_STEP_S, POSE_LONGEST_S = 0.5, 1.5
 class FrameChoice:
     """The chosen reading.
 
-    agreement: its fit. imu: its hypothesis of the IMU. says: doubts, such as another reading that fits equally well
-    with another mounting.
+    agreement: its fit.
+    imu: its hypothesis of the IMU.
+    says: doubts, such as another reading that fits equally well with another mounting.
     """
 
     agreement: Agreement
@@ -136,6 +137,19 @@ class _Tried:
         return prior
 
 
+class _Hypothesis(NamedTuple):
+    """What a reading assumes.
+
+    prior: log odds.
+    imu: hypothesis of the IMU, None without one.
+    turned_as_declared: whether the axes of the DVL are the declared ones.
+    """
+
+    prior: float
+    imu: ImuHypothesis | None
+    turned_as_declared: bool
+
+
 class FrameChooser:
     """Chooser of the frames of one recording's streams."""
 
@@ -144,12 +158,12 @@ class FrameChooser:
         parameters: Parameters,
         given: frozenset[str],
         base_frame: str,
-        dvl: Look,
+        dvl: Preview,
         dvl_placed: Placed | None,
-        imu: Look | None,
+        imu: Preview | None,
         imu_placed: Placed | None,
     ) -> None:
-        """Set up. given: names of parameters that the user set."""
+        """Collect the hypotheses of the IMU. given: names of parameters that the user set."""
         self._parameters, self._given, self._base_frame = parameters, given, base_frame
         self._dvl, self._dvl_placed = dvl, dvl_placed
         self._imu, self._imu_placed = imu, imu_placed
@@ -159,22 +173,36 @@ class FrameChooser:
     @property
     def imu(self) -> ImuHypothesis | None:
         """Most likely hypothesis of the IMU by its own data alone."""
-        return max(self.imus, key=lambda each: each.prior, default=None)
+        return max(self.imus, key=lambda imu: imu.prior, default=None)
 
     @property
     def _says_z_down(self) -> bool:
         return self._parameters.is_z_down or self._base_frame.lower().endswith(("_frd", "_ned"))
 
     def _imu_hypotheses(self) -> list[ImuHypothesis]:
-        """Return the possible frames of the IMU, each with a penalty for being unusual or contradicting gravity."""
-        imu, placed = self._imu, self._imu_placed
-        if imu is None:
+        """Return the hypotheses of the IMU: as configured, else each possible frame with its log prior odds."""
+        if self._imu is None:
             return []
         if self._given & {"imu_rpy", "imu_frame"}:
             rotation = rotation_from_rpy(self._parameters.imu_rpy)
             frame = ImuFrame(rotation, self._parameters.imu_frame, "as given", self._parameters.heading_offset)
             return [ImuHypothesis(frame, self._parameters.is_z_down, 0.0)]
-        body_from_imu = np.eye(3) if placed is None else placed.rotation
+        hypotheses = []
+        for frame, prior in self._imu_frames():
+            z_down = self._body_is_z_down(frame)
+            if "base_axes" not in self._given or z_down == self._parameters.is_z_down:
+                frame = replace(frame, heading_offset=self._parameters.heading_offset)
+                hypotheses.append(ImuHypothesis(frame, z_down, self._imu_prior(frame, prior, z_down)))
+        return hypotheses
+
+    @property
+    def _body_from_imu(self) -> Array:
+        """Rotation (3, 3) from the IMU to the body by transforms; identity without any."""
+        return np.eye(3) if self._imu_placed is None else self._imu_placed.rotation
+
+    def _imu_frames(self) -> list[tuple[ImuFrame, float]]:
+        """Return the possible frames of an IMU that is not configured, with the log odds of their frequency."""
+        placed, body_from_imu = self._imu_placed, self._body_from_imu
         placement = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
         frames = [
             (ImuFrame(body_from_imu, IMU_ENU, placement), 0.0),
@@ -190,24 +218,24 @@ class FrameChooser:
             frames.append((ImuFrame(np.eye(3), IMU_ENU, note), IMU_IN_OTHER_WORLD))
         if self._gravity is not None:
             frames.append((ImuFrame(body_from_imu @ FLU_FROM_FRD, IMU_ENU, f"turned over, {placement}"), IMU_OTHERWISE))
-        hypotheses = []
-        for frame, prior in frames:
-            z_down = self._body_is_z_down(frame)
-            if "base_axes" in self._given and z_down != self._parameters.is_z_down:
-                continue
-            if z_down and frame.world == IMU_NED and frame.rotation_body_from_imu is body_from_imu:
-                prior = 0.0  # world of a vehicle that is z down
-            elif z_down:
-                prior += IMU_IN_OTHER_WORLD
-            if z_down != self._says_z_down:
-                is_placed = placed is not None or self._dvl_placed is not None
-                prior += BASE_Z_DOWN if is_placed else UNPLACED_BASE_Z_DOWN
-            if self._gravity is not None:
-                wrong = self._gravity.contradicts(frame.rotation_body_from_imu, frame.world, z_down)
-                prior += (0.0, GRAVITY_CONTRADICTS, GRAVITY_INVERTED)[wrong]
-            frame = replace(frame, heading_offset=self._parameters.heading_offset)
-            hypotheses.append(ImuHypothesis(frame, z_down, prior))
-        return hypotheses
+        return frames
+
+    def _imu_prior(self, frame: ImuFrame, prior: float, z_down: bool) -> float:
+        """Return the log odds of an IMU frame, with those of the body's axes under it and of gravity.
+
+        prior: log odds of the frame's frequency. z_down: whether the body is z down under the frame.
+        """
+        if z_down and frame.world == IMU_NED and np.array_equal(frame.rotation_body_from_imu, self._body_from_imu):
+            prior = 0.0  # world of a vehicle that is z down
+        elif z_down:
+            prior += IMU_IN_OTHER_WORLD
+        if z_down != self._says_z_down:
+            is_placed = self._imu_placed is not None or self._dvl_placed is not None
+            prior += BASE_Z_DOWN if is_placed else UNPLACED_BASE_Z_DOWN
+        if self._gravity is not None:
+            wrong = self._gravity.contradicts(frame.rotation_body_from_imu, frame.world, z_down)
+            prior += (0.0, GRAVITY_CONTRADICTS, GRAVITY_INVERTED)[wrong]
+        return prior
 
     def _body_is_z_down(self, frame: ImuFrame) -> bool:
         """Return whether the body's z points down under a hypothesis of the IMU, by its attitude."""
@@ -235,7 +263,7 @@ class FrameChooser:
     def _dvl_axes_are_said(self) -> bool:
         return self._parameters.dvl_axes != FROM_MESSAGE or self._dvl.frame_id.lower().endswith(("_frd", "_flu"))
 
-    def _reference_priors(self, reference: Look, imu: ImuHypothesis | None) -> dict[str, float]:
+    def _reference_priors(self, reference: Preview, imu: ImuHypothesis | None) -> dict[str, float]:
         """Return the log odds of the frames that a reference may be in, by name."""
         z_down = self._says_z_down if imu is None else imu.z_down
         own_axes, other_axes = (FRD, FLU) if z_down else (FLU, FRD)
@@ -261,7 +289,7 @@ class FrameChooser:
             priors["body" if is_frd else FRD] += TWIST_RATES_OTHER
         return priors
 
-    def _points_down(self, reference: Look, imu: ImuHypothesis | None) -> bool:
+    def _points_down(self, reference: Preview, imu: ImuHypothesis | None) -> bool:
         """Return whether a twist is forward-right-down, by its turn rates or else by its pose's world."""
         if self._imu is not None and imu is not None and reference.rates is not None:
             is_frd = are_rates_frd(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
@@ -271,89 +299,91 @@ class FrameChooser:
         return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
 
     def choose(
-        self, readings: Readings, reference: Look, mounting: Array | None, arm_is_known: bool
+        self, readings: Readings, reference: Preview, mounting: Array | None, arm_is_known: bool
     ) -> FrameChoice | None:
         """Return the most likely reading; None if none can be evaluated.
 
         mounting: rotation_dvl_from_body (3, 3), None if unknown. arm_is_known: whether transforms define the lever arm.
         """
-        priors: dict[Reading, float] = {}
-        as_declared: dict[Reading, bool] = {}
-        imus: dict[Reading, ImuHypothesis | None] = {}
-        for imu in (*self.imus,) or (None,):
-            z_down = self._says_z_down if imu is None else imu.z_down
-            declared = self.dvl_is_turned(z_down)
-            for name, prior in self._reference_priors(reference, imu).items():
-                for is_turned in {declared} if self._dvl_axes_are_said else {declared, not declared}:
-                    reading = Reading(name, None if imu is None else imu.frame, is_turned)
-                    imus[reading] = imu
-                    priors[reading] = prior + (0.0 if imu is None else imu.prior)
-                    as_declared[reading] = declared
-                    if is_turned != declared:
-                        priors[reading] += DVL_AXES_OTHER
-        found = readings.agreements(list(priors), mounting)
+        hypotheses = self._hypotheses(reference)
+        found = readings.agreements(list(hypotheses), mounting)
         declared_frame = declared_reference(reference, self._parameters, self._base_frame)
         in_earth = declared_frame is not None and declared_frame.frame is not VelocityFrame.BODY
-        if not found or (in_earth and all(each.reading.in_body for each in found)):
+        if not found or (in_earth and all(agreement.reading.in_body for agreement in found)):
             return None  # without an attitude the declaration cannot be tested and is kept
-        candidates = [_Tried(each, mounting, priors[each.reading]) for each in found]
+        candidates = [_Tried(agreement, mounting, hypotheses[agreement.reading].prior) for agreement in found]
         if mounting is not None:  # or the mounting is wrong, and the DVL's axes are as declared
-            free = readings.agreements([each for each in priors if each.turned == as_declared[each]], None)
+            declared = [reading for reading, assumed in hypotheses.items() if assumed.turned_as_declared]
             candidates += [
-                _Tried(each, None, priors[each.reading] + MOUNTING_OTHER)
-                for each in free
-                if angle_between(each.rotation_dvl_from_body, mounting) > TURNED_FROM
+                _Tried(agreement, None, hypotheses[agreement.reading].prior + MOUNTING_OTHER)
+                for agreement in readings.agreements(declared, None)
+                if angle_between(agreement.rotation_dvl_from_body, mounting) > TURNED_FROM
             ]
         first_odds = {
-            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.residual)
-            for each in candidates
+            tried: tried.odds(tried.agreement.rotation_dvl_from_body) + readings.log_likelihood(tried.residual)
+            for tried in candidates
         }
-        ranked = sorted(candidates, key=lambda each: -first_odds[each])
+        ranked = sorted(candidates, key=lambda tried: -first_odds[tried])
         reasons: tuple[Reason, ...] = ()
         if in_earth:
             first_best = ranked[0].agreement
             if first_best.reading.in_body and not readings.is_in_body(first_best):
                 reasons = (finding("BODY_OR_EARTH"),)
-                ranked = [each for each in ranked if not each.reading.in_body] or ranked
-        likely = [each for each in ranked if first_odds[each] > first_odds[ranked[0]] - FAR_WORSE][:MOST_REGISTERED]
-        most_expected = max(ranked, key=lambda each: each.prior)
+                ranked = [candidate for candidate in ranked if not candidate.reading.in_body] or ranked
+        likely = [tried for tried in ranked if first_odds[tried] > first_odds[ranked[0]] - FAR_WORSE][:MOST_REGISTERED]
+        most_expected = max(ranked, key=lambda tried: tried.prior)
         if most_expected not in likely:
             likely.append(most_expected)
         if likely == [most_expected] and most_expected.mounting is mounting:
-            return FrameChoice(most_expected.agreement, imus[most_expected.reading], reasons)
-        fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
+            return FrameChoice(most_expected.agreement, hypotheses[most_expected.reading].imu, reasons)
+        fits = {candidate: readings.registered(candidate.reading, candidate.mounting) for candidate in likely}
         odds = {
-            each: each.odds(fit.rotation_dvl_from_body)
+            tried: tried.odds(fit.rotation_dvl_from_body)
             + (_arm_odds(fit) if arm_is_known else 0.0)
             + readings.log_likelihood_registered(fit.residual)
-            for each, fit in fits.items()
+            for tried, fit in fits.items()
         }
         if math.inf in (fit.residual for fit in fits.values()):  # a failed registration is no evidence
             odds = first_odds
-            rotations = {each: each.agreement.rotation_dvl_from_body for each in fits}
-            fits = {each: fit._replace(rotation_dvl_from_body=rotations[each]) for each, fit in fits.items()}
-        best, *others = sorted(likely, key=lambda each: -odds[each])
-        equally_likely = [each for each in others if odds[each] > odds[best] - AS_LIKELY]
-        for rival in equally_likely:
-            best_options, rival_options = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
+            fits = {
+                tried: fit._replace(rotation_dvl_from_body=tried.agreement.rotation_dvl_from_body)
+                for tried, fit in fits.items()
+            }
+        best, *others = sorted(likely, key=lambda tried: -odds[tried])
+        imu, best_rotation = hypotheses[best.reading].imu, fits[best].rotation_dvl_from_body
+        for rival in (other for other in others if odds[other] > odds[best] - AS_LIKELY):
+            best_options = self._options(best.reading, imu)
+            rival_options = self._options(rival.reading, hypotheses[rival.reading].imu)
             other_axes = any(best_options[name] != rival_options[name] for name in ("dvl_axes", "base_axes"))
             # in which the IMU's frame affects only the lever arm
             in_body = best.reading.in_body and rival.reading.in_body
-            fitted = [fits[each].rotation_dvl_from_body for each in (best, rival)]
+            fitted = [best_rotation, fits[rival].rotation_dvl_from_body]
             if other_axes or (not in_body and angle_between(*fitted) > SAME_ANSWER):
                 reasons += (_ambiguous(best_options, rival_options, fitted),)
                 break
-        best_rotation = fits[best].rotation_dvl_from_body
         if (
             mounting is not None
             and best.mounting is None
             and not readings.are_axes_mirrored(best.reading, best_rotation, mounting)
         ):
-            imu = None if best.reading.in_body else imus[best.reading]
+            rotating_imu = None if best.reading.in_body else imu
             mean = self._dvl.values[np.isfinite(self._dvl.values).all(axis=1)].mean(axis=0)
             travel = FLU_FROM_FRD @ mean if best.reading.turned else mean
-            reasons += (_mounting_contradicted(mounting.T, best_rotation.T, imu, travel),)
-        return FrameChoice(best.agreement, imus[best.reading], reasons)
+            reasons += (_mounting_contradicted(mounting.T, best_rotation.T, rotating_imu, travel),)
+        return FrameChoice(best.agreement, imu, reasons)
+
+    def _hypotheses(self, reference: Preview) -> dict[Reading, _Hypothesis]:
+        """Return all readings: each frame of the reference, under each hypothesis of the IMU, with either DVL axes."""
+        hypotheses: dict[Reading, _Hypothesis] = {}
+        for imu in (*self.imus,) or (None,):
+            frame, imu_prior = (None, 0.0) if imu is None else (imu.frame, imu.prior)
+            declared = self.dvl_is_turned(self._says_z_down if imu is None else imu.z_down)
+            for name, prior in self._reference_priors(reference, imu).items():
+                for is_turned in {declared} if self._dvl_axes_are_said else {declared, not declared}:
+                    axes_prior = 0.0 if is_turned == declared else DVL_AXES_OTHER
+                    reading = Reading(name, frame, is_turned)
+                    hypotheses[reading] = _Hypothesis(prior + imu_prior + axes_prior, imu, is_turned == declared)
+        return hypotheses
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
         """Return a reading as values of parameters."""
@@ -384,7 +414,8 @@ def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Arr
 def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None, travel: Array) -> Reason:
     """Return the finding that another mounting fits; its remedy also names a heading offset or axes that look the same.
 
-    given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
+    given, found: (3, 3) rotation_body_from_dvl.
+    imu: by which the reference is turned into the body, None for none.
     travel: (3,) m/s, mean velocity in the DVL. It is ahead with `given` if the heading is wrong, else with `found`.
     """
     rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)
@@ -412,7 +443,7 @@ def _arm_odds(fit: Registered) -> float:
     return -0.5 * min(float((fit.arm**2 / variance).sum()), MOST_OF_ARM)
 
 
-def declared_reference(reference: Look, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:
+def declared_reference(reference: Preview, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:
     """Return the frame that a reference declares; None if none."""
     if parameters.gnss_frame != FROM_FRAME_ID:
         return DECLARED_FRAMES[parameters.gnss_frame]
@@ -422,16 +453,16 @@ def declared_reference(reference: Look, parameters: Parameters, base_frame: str)
     return frame_named(reference.frame_id, (parameters.base_frame, base_frame))
 
 
-def twist_axes(look: Look) -> str | None:
+def twist_axes(preview: Preview) -> str | None:
     """Return the frame of an odometry's twist by the motion of its pose, as gnss_frame; None if not observable.
 
     Its pose p, R moves by the twist v: dp = R v dt if v is in the axes of the pose's body.
     """
-    if look.pose is None or not len(look.pose):
+    if preview.pose is None or not len(preview.pose):
         return None
-    quaternion = unit_quaternions(look.pose[:, 3:])
-    known = np.isfinite(quaternion).all(axis=1) & np.isfinite(look.values).all(axis=1)
-    times, position, velocity = look.stamps_s[known], look.pose[known, :3], look.values[known]
+    quaternion = unit_quaternions(preview.pose[:, 3:])
+    known = np.isfinite(quaternion).all(axis=1) & np.isfinite(preview.values).all(axis=1)
+    times, position, velocity = preview.stamps_s[known], preview.pose[known, :3], preview.values[known]
     if len(times) < 2:
         return None
     rotation = rotation_from_quaternion(quaternion[known])
@@ -448,13 +479,13 @@ def twist_axes(look: Look) -> str | None:
         path = np.cumsum(0.5 * intervals * (velocities + np.roll(velocities, 1, axis=0)), axis=0)
         return float(np.sqrt((((path[after] - path[before]) / seconds - pose_velocity) ** 2).sum(axis=1).mean()))
 
-    in_body_axes = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
+    in_body_axes = {name: np.einsum("nij,nj->ni", rotation, velocity @ axes) for name, axes in _BODY_AXES.items()}
     hypotheses = {**in_body_axes, "enu": velocity, "ned": velocity @ ENU_FROM_NED}
     residuals = {name: residual(velocities) for name, velocities in hypotheses.items()}
     best, second = sorted(residuals, key=residuals.__getitem__)[:2]
-    if residuals[best] > MAX_RESIDUAL * look.speed or residuals[best] > BETTER_BY * residuals[second]:
+    if residuals[best] > MAX_RESIDUAL * preview.speed or residuals[best] > BETTER_BY * residuals[second]:
         return None
-    world = frame_named(look.world, ())
+    world = frame_named(preview.world, ())
     in_ned = world is not None and world.frame is VelocityFrame.NED
     if best in _BODY_AXES:
         body_down = (float(rotation[:, 2, 2].mean()) < 0.0) != in_ned

@@ -49,8 +49,8 @@ class Gravity(NamedTuple):
         if size < LEAST:
             return None
         relative, rotation = acceleration[known] / size, rotation_from_quaternion(quaternion[known])
-        world, inverted = (np.matmul(each, relative[..., None])[..., 0] for each in (rotation, rotation.swapaxes(1, 2)))
-        across = [math.sqrt(float((each[:, :2] ** 2).sum(axis=1).mean())) for each in (world, inverted)]
+        world, inverted = (np.matmul(turn, relative[..., None])[..., 0] for turn in (rotation, rotation.swapaxes(1, 2)))
+        across = [math.sqrt(float((axis[:, :2] ** 2).sum(axis=1).mean())) for axis in (world, inverted)]
         return Gravity(size, relative.mean(axis=0), world.mean(axis=0), *across)
 
     def contradicts(self, rotation_body_from_imu: Array, world: str, z_down: bool) -> int:
@@ -63,7 +63,10 @@ class Gravity(NamedTuple):
     def contradiction(
         self, topic: str, rotation_body_from_imu: Array, world: str, z_down: bool = False
     ) -> Reason | None:
-        """Return the contradiction between gravity and an assumed convention of the IMU's data."""
+        """Return the contradiction between gravity and an assumed convention of the IMU's data.
+
+        rotation_body_from_imu: (3, 3). world: frame of the orientation, as imu_frame. z_down: of base_frame.
+        """
         body_up, up = self._up_in_body(rotation_body_from_imu, z_down), self._up(world)
         if body_up < -CLEARLY and up < -CLEARLY:
             return finding("GRAVITY_SIGN", topic=topic)

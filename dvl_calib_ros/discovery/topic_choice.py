@@ -13,7 +13,7 @@ from ..recordings.topics import ORIENTATION, spelled
 from ..verdict.reasons import Reason, finding
 
 if TYPE_CHECKING:
-    from ..recordings.topic_preview import Look, Survey
+    from ..recordings.topic_preview import Preview, Survey
 
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
 # Satellites first, then other navigation systems. A simulator's truth is equivalent to either.
@@ -35,13 +35,13 @@ MOVES_FROM = 0.02
 # two velocities that differ by less than this share of the speed were derived from each other
 SAME_SHARE = 1e-4
 
-Difference = Callable[["Look", "Look"], "float | None"]
+Difference = Callable[["Preview", "Preview"], "float | None"]
 """DVL and reference -> residual of their difference after the best rotation, as a share of the speed; None: unknown."""
 
 
-def _has(look: Look, words: Iterable[str]) -> bool:
+def _has(preview: Preview, words: Iterable[str]) -> bool:
     """Return whether a topic's name or frame has one of these words; short words only as a separate part."""
-    return _contains_word(f"{look.topic} {look.frame_id}", words)
+    return _contains_word(f"{preview.topic} {preview.frame_id}", words)
 
 
 def _contains_word(text: str, words: Iterable[str]) -> bool:
@@ -57,9 +57,9 @@ def may_be_dvl(topic: str, msgtype: str) -> bool:
     return msgtype in DVL_TYPES and (msgtype not in REFERENCE_TYPES or _contains_word(topic, DVL_WORDS))
 
 
-def is_derived(look: Look) -> bool:
+def is_derived(preview: Preview) -> bool:
     """Return whether a velocity seems to be derived from the DVL, or commanded."""
-    return _has(look, (*DERIVED_WORDS, *COMMAND_WORDS))
+    return _has(preview, (*DERIVED_WORDS, *COMMAND_WORDS))
 
 
 def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, where: str) -> str:
@@ -88,13 +88,14 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
     standard = spelled(default, present)
     if standard is not None and present[standard] in DVL_TYPES:
         return standard
-    looks = [look for look in survey.looks.values() if look.msgtype in DVL_TYPES]
-    own_type = [look for look in looks if look.msgtype not in REFERENCE_TYPES]
-    named = [look for look in looks if _has(look, DVL_WORDS) and not is_derived(look)]
+    previews = [preview for preview in survey.previews.values() if preview.msgtype in DVL_TYPES]
+    own_type = [preview for preview in previews if preview.msgtype not in REFERENCE_TYPES]
+    named = [preview for preview in previews if _has(preview, DVL_WORDS) and not is_derived(preview)]
     found = own_type or named
     if not found:
-        velocities = [look for look in looks if not _has(look, (*GNSS_WORDS, *TRUTH_WORDS)) and not is_derived(look)]
-        if len(velocities) == 1 and len(looks) > 1:
+        no_dvl = (*GNSS_WORDS, *TRUTH_WORDS)
+        velocities = [preview for preview in previews if not _has(preview, no_dvl) and not is_derived(preview)]
+        if len(velocities) == 1 and len(previews) > 1:
             return velocities[0].topic
         unlisted = [name for name in survey.field_maps if not _contains_word(name, (*DERIVED_WORDS, *COMMAND_WORDS))]
         unlisted.sort(key=lambda name: not _contains_word(f"{name} {present[name]}", DVL_WORDS))
@@ -103,27 +104,27 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
     order = list(DVL_TYPES)
     # of several forms of one velocity, prefer the plain type, then the raw one
     order.sort(key=lambda name: (name in REFERENCE_TYPES, name != TWIST_TYPE))
-    return min(found, key=lambda look: (order.index(look.msgtype), not look.speed, -look.count, look.topic)).topic
+    return min(found, key=lambda topic: (order.index(topic.msgtype), not topic.speed, -topic.count, topic.topic)).topic
 
 
-def is_another_dvl(look: Look, dvl: Look) -> bool:
+def is_another_dvl(preview: Preview, dvl: Preview) -> bool:
     """Return whether a topic is a second DVL's, by its type or name, and by its frame."""
-    own_frame = any(word in look.frame_id.lower() for word in DVL_WORDS)
-    is_one = look.msgtype in DVL_TYPES and (look.msgtype not in REFERENCE_TYPES or own_frame)
-    moves = look.speed >= MOVES_FROM and not is_derived(look)
-    return is_one and look.topic != dvl.topic and moves and bool(look.frame_id) and look.frame_id != dvl.frame_id
+    own_frame = any(word in preview.frame_id.lower() for word in DVL_WORDS)
+    is_dvl = preview.msgtype in DVL_TYPES and (preview.msgtype not in REFERENCE_TYPES or own_frame)
+    moves = preview.speed >= MOVES_FROM and not is_derived(preview)
+    return is_dvl and moves and preview.topic != dvl.topic and preview.frame_id not in ("", dvl.frame_id)
 
 
 def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[Reason]:
     """Return the notes on DVLs that are not calibrated here."""
-    look = survey.looks.get(dvl)
-    if look is None:
+    calibrated = survey.previews.get(dvl)
+    if calibrated is None:
         return []
-    others = [each for each in survey.looks.values() if is_another_dvl(each, look)]
-    measured = [each for each in others if (difference(look, each) or 0.0) >= SAME_SHARE]
+    others = [preview for preview in survey.previews.values() if is_another_dvl(preview, calibrated)]
+    measured = [other for other in others if (difference(calibrated, other) or 0.0) >= SAME_SHARE]
     return [
-        finding("SECOND_DVL", topic=dvl, frame=look.frame_id, other=each.topic, other_frame=each.frame_id)
-        for each in sorted(measured, key=lambda each: each.topic)
+        finding("SECOND_DVL", topic=dvl, frame=calibrated.frame_id, other=other.topic, other_frame=other.frame_id)
+        for other in sorted(measured, key=lambda other: other.topic)
     ]
 
 
@@ -132,43 +133,45 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
     standard = spelled(default, survey.topics)
     if standard is not None and survey.topics[standard] in REFERENCE_TYPES:
         return standard, []
-    dvl_look = survey.looks.get(dvl)
-    ranked: list[tuple[tuple[float, ...], Look]] = []
+    dvl_preview = survey.previews.get(dvl)
+    ranked: list[tuple[tuple[float, ...], Preview]] = []
     reasons: list[Reason] = []
-    for look in survey.looks.values():
-        if look.topic == dvl or look.msgtype not in REFERENCE_TYPES or _has(look, COMMAND_WORDS):
+    for preview in survey.previews.values():
+        if preview.topic == dvl or preview.msgtype not in REFERENCE_TYPES or _has(preview, COMMAND_WORDS):
             continue
-        if look.msgtype in POSE_TYPES and not _has(look, (*ACOUSTIC_WORDS, *TRUTH_WORDS)):
+        if preview.msgtype in POSE_TYPES and not _has(preview, (*ACOUSTIC_WORDS, *TRUTH_WORDS)):
             continue
-        if look.speed < MOVES_FROM:
-            reasons.append(finding("TOPIC_DOES_NOT_MOVE", topic=look.topic))
+        if preview.speed < MOVES_FROM:
+            reasons.append(finding("TOPIC_DOES_NOT_MOVE", topic=preview.topic))
             continue
-        share = None if dvl_look is None else difference(dvl_look, look)
-        if _has(look, DVL_WORDS) or (share is not None and share < SAME_SHARE):
-            if dvl_look is None or not is_another_dvl(look, dvl_look) or (share is not None and share < SAME_SHARE):
-                reasons.append(finding("TOPIC_FROM_DVL", topic=look.topic))
+        share = None if dvl_preview is None else difference(dvl_preview, preview)
+        if _has(preview, DVL_WORDS) or (share is not None and share < SAME_SHARE):
+            if (
+                dvl_preview is None
+                or not is_another_dvl(preview, dvl_preview)
+                or (share is not None and share < SAME_SHARE)
+            ):
+                reasons.append(finding("TOPIC_FROM_DVL", topic=preview.topic))
             continue
-        if is_derived(look):
-            reasons.append(finding("TOPIC_DERIVED", topic=look.topic))
+        if is_derived(preview):
+            reasons.append(finding("TOPIC_DERIVED", topic=preview.topic))
             continue
-        kind = next((i for i, words in enumerate((GNSS_WORDS, TRUTH_WORDS, INS_WORDS)) if _has(look, words)), 3)
+        kind = next((i for i, words in enumerate((GNSS_WORDS, TRUTH_WORDS, INS_WORDS)) if _has(preview, words)), 3)
         fits = 0.0 if share is None or share < 0.5 else 1.0
-        ranked.append(((fits, kind, _rank(look), -look.rate_hz), look))
+        ranked.append(((fits, kind, _rank(preview), -preview.rate_hz), preview))
     if not ranked:
         return None, reasons
-    ranked.sort(key=lambda each: (each[0], each[1].topic))
-    chosen = ranked[0][1]
-    others = [look.topic for _, look in ranked[1:]]
+    chosen, *others = [topic for _, topic in sorted((order, preview.topic) for order, preview in ranked)]
     if others:
-        reasons.append(finding("SEVERAL_REFERENCES", topic=chosen.topic, others=", ".join(others)))
-    return chosen.topic, reasons
+        reasons.append(finding("SEVERAL_REFERENCES", topic=chosen, others=", ".join(others)))
+    return chosen, reasons
 
 
-def _rank(look: Look) -> float:
+def _rank(preview: Preview) -> float:
     """Return the sort key of forms of one velocity: with a covariance first, positions last."""
-    if REFERENCE_TYPES[look.msgtype].position is not None:
+    if REFERENCE_TYPES[preview.msgtype].position is not None:
         return 2.0
-    return 0.0 if look.msgtype == TWIST_TYPE else 1.0
+    return 0.0 if preview.msgtype == TWIST_TYPE else 1.0
 
 
 def choose_imu(survey: Survey, default: str, reference: str = "") -> str | None:
@@ -177,16 +180,16 @@ def choose_imu(survey: Survey, default: str, reference: str = "") -> str | None:
     of_poses = reference + ORIENTATION
     if standard is not None and survey.topics[standard] == IMU_TYPE and of_poses not in survey.topics:
         return standard
-    looks = [look for look in survey.looks.values() if look.msgtype == IMU_TYPE]
-    if not looks:
+    previews = [preview for preview in survey.previews.values() if preview.msgtype == IMU_TYPE]
+    if not previews:
         return None
 
-    def order(look: Look) -> tuple[object, ...]:
-        name = look.topic.lower()
-        last = ("raw" in name, "filtered" in name, -look.count, name)
-        return (not look.has_orientation, look.topic != of_poses, _has(look, DVL_WORDS), *last)
+    def order(preview: Preview) -> tuple[object, ...]:
+        name = preview.topic.lower()
+        last = ("raw" in name, "filtered" in name, -preview.count, name)
+        return (not preview.has_orientation, preview.topic != of_poses, _has(preview, DVL_WORDS), *last)
 
-    return min(looks, key=order).topic
+    return min(previews, key=order).topic
 
 
 def _listing(survey: Survey) -> str:

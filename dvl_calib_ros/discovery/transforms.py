@@ -49,15 +49,15 @@ class FrameTree:
         tree = FrameTree()
         for text in descriptions:
             tree._add_urdf(text)
-        for each in transforms:
-            t, q = each.transform.translation, each.transform.rotation
+        for transform in transforms:
+            t, q = transform.transform.translation, transform.transform.rotation
             quaternion = np.array([q.x, q.y, q.z, q.w])
             length = float(np.linalg.norm(quaternion))
             if not 0.5 < length < 2.0 or not np.isfinite([t.x, t.y, t.z]).all():
-                tree.problems.append(finding("TRANSFORM_NOT_ROTATION", frame=each.child_frame_id))
+                tree.problems.append(finding("TRANSFORM_NOT_ROTATION", frame=transform.child_frame_id))
                 continue
             rotation = rotation_from_quaternion(quaternion / length)
-            parent, child = _plain(each.header.frame_id), _plain(each.child_frame_id)
+            parent, child = _plain(transform.header.frame_id), _plain(transform.child_frame_id)
             tree._parents[child] = (parent, rotation, np.array([t.x, t.y, t.z]), "/tf_static")
         return tree
 
@@ -100,30 +100,32 @@ class FrameTree:
         known = {*self._parents, *(parent for parent, *_ in self._parents.values())}
         if name in known:
             return name
-        last = name.rsplit("/", 1)[-1]
-        same = [each for each in known if last and each.rsplit("/", 1)[-1] == last]
+        last = _last_part(name)
+        same = [other for other in known if last and _last_part(other) == last]
         return same[0] if len(same) == 1 else None
 
-    def base(self, frame: str, wanted: str) -> str | None:
-        """Return the body above a frame: `wanted`, with any namespace; else the highest that is no earth frame."""
+    def body_above(self, frame: str, wanted: str) -> str | None:
+        """Return the body frame above a frame; None if there is none.
+
+        This is the frame named `wanted`, in any namespace, else the highest one that is no earth frame.
+        """
         name = frame
         above: list[str] = []
         while name in self._parents and len(above) < LONGEST_CHAIN:
             name = self._parents[name][0]
             above.append(name)
-        last = _plain(wanted).rsplit("/", 1)[-1]
-        for each in above:
-            if each.rsplit("/", 1)[-1] == last:
-                return each
-        vehicle = [each for each in above if each.rsplit("/", 1)[-1].lower() not in EARTH_NAMES]
-        return vehicle[-1] if vehicle else None
+        for link in above:
+            if _same(link, wanted):
+                return link
+        of_vehicle = [link for link in above if _last_part(link).lower() not in EARTH_NAMES]
+        return of_vehicle[-1] if of_vehicle else None
 
     def placed(self, frame_id: str, base_frame: str) -> Placed | None:
         """Return the pose of a frame in the body; None if the transforms do not connect them."""
         frame = self.named(frame_id)
         if frame is None:
             return None
-        base = self.base(frame, base_frame)
+        base = self.body_above(frame, base_frame)
         if base is None:
             return Placed(frame, frame, np.eye(3), np.zeros(3), "") if _same(frame, base_frame) else None
         rotation, position, sources = np.eye(3), np.zeros(3), []
@@ -136,7 +138,7 @@ class FrameTree:
         source = " and ".join(dict.fromkeys(sources))
         return Placed(base, frame, rotation, position if is_located else np.zeros(3), source, is_located)
 
-    def likely(self, words: Iterable[str]) -> str | None:
+    def only_named_like(self, words: Iterable[str]) -> str | None:
         """Return the only frame whose name has one of these words, for a frame_id that is not in the tree."""
         found = [frame for frame in sorted(self._parents) if any(word in frame.lower() for word in words)]
         return found[0] if len(found) == 1 else None
@@ -150,8 +152,14 @@ def _plain(frame_id: str) -> str:
     return frame_id.strip("/")
 
 
+def _last_part(frame: str) -> str:
+    """Return the name of a frame without its namespace."""
+    return frame.rsplit("/", 1)[-1]
+
+
 def _same(frame: str, base: str) -> bool:
-    return frame.rsplit("/", 1)[-1] == _plain(base).rsplit("/", 1)[-1]
+    """Return whether two names are one frame, but for namespaces."""
+    return _last_part(frame) == _last_part(_plain(base))
 
 
 # range of parameter lever_arm, m; a larger value is a transform in another unit

@@ -281,7 +281,10 @@ def _lock(handle: int, patience_s: float) -> bool:
 
 
 def _second_name(target: Path, temporary: str) -> Path:
-    """Link the previous file to a hidden name that identifies its target."""
+    """Return a hidden second name for the previous file of a target, by a hard link or else a copy.
+
+    If the process is killed, the next save of the target finds the file by that name (`_stranded_prefix`).
+    """
     name = target.with_name(f"{_stranded_prefix(target)}{secrets.token_hex(4)}{_STRANDED}")
     try:
         os.link(target, name)
@@ -299,6 +302,7 @@ def _second_name(target: Path, temporary: str) -> Path:
 
 
 def _stranded_prefix(target: Path) -> str:
+    """Return how the hidden names begin of a target's previous files that killed saves left behind."""
     return f"{_PREFIX}{zlib.crc32(os.fsencode(target.name)):08x}."
 
 
@@ -307,26 +311,26 @@ def _rotate(target: Path, before: Path | None, keep: Keep, is_alone: bool) -> No
     stranded = [] if before is None else [before]
     if is_alone:
         found = target.parent.glob(f"{_stranded_prefix(target)}*{_STRANDED}")
-        stranded += sorted((each for each in found if each != before), key=_modified_ns, reverse=True)
+        stranded += sorted((backup for backup in found if backup != before), key=_modified_ns, reverse=True)
     if not stranded:
         return
-    inodes = [each.stat().st_ino for each in [*stranded, target]]
-    for each in [each for i, each in enumerate(stranded) if inodes[i] in inodes[:i] + inodes[-1:]]:
-        os.unlink(each)  # left by a save that was killed before its rename
-        stranded.remove(each)
-    existing = _backups(target) if keep is not newest_only else [each for each in [backup_of(target)] if each.exists()]
+    inodes = [path.stat().st_ino for path in [*stranded, target]]
+    for path in [path for i, path in enumerate(stranded) if inodes[i] in inodes[:i] + inodes[-1:]]:
+        os.unlink(path)  # left by a save that was killed before its rename
+        stranded.remove(path)
+    existing = _backups(target) if keep is not newest_only else [path for path in [backup_of(target)] if path.exists()]
     kept = keep([*stranded, *existing])
-    for each in {*stranded, *existing} - {*kept}:
+    for path in {*stranded, *existing} - {*kept}:
         with suppress(FileNotFoundError):
-            os.unlink(each)
-    targets = dict(zip(kept, map(backup_of(target).with_name, _backup_names(target, len(kept))), strict=True))
-    moves = [(each, place) for each, place in targets.items() if each != place]
+            os.unlink(path)
+    names = map(backup_of(target).with_name, _backup_names(target, len(kept)))
+    moves = [(path, name) for path, name in zip(kept, names, strict=True) if path != name]
     # move each file only to a free name: upward moves from the last on, then downward moves
-    upward = [move for move in moves if move[0] in stranded or _number(move[0]) < _number(move[1])]
-    for each, place in [*reversed(upward), *(move for move in moves if move not in upward)]:
-        os.replace(each, place)
+    upward = [(path, name) for path, name in moves if path in stranded or _number(path) < _number(name)]
+    for path, name in [*reversed(upward), *(move for move in moves if move not in upward)]:
+        os.replace(path, name)
         with suppress(FileNotFoundError):  # os.replace between two links of one file does nothing
-            os.unlink(each)
+            os.unlink(path)
 
 
 def _modified_ns(path: Path) -> int:
@@ -340,7 +344,7 @@ def _backup_names(target: Path, count: int) -> list[str]:
 def _backups(target: Path) -> list[Path]:
     """Return all backups of a file, newest first."""
     pattern = re.compile(re.escape(target.name) + r"\.bak(\.[1-9]\d{0,3})?")
-    return sorted((each for each in target.parent.iterdir() if pattern.fullmatch(each.name)), key=_number)
+    return sorted((path for path in target.parent.iterdir() if pattern.fullmatch(path.name)), key=_number)
 
 
 def _number(backup: Path) -> int:

@@ -93,10 +93,10 @@ def load_yaml(path: Path, what: str, text: str | None = None) -> Any:
             text = content.decode("utf-8")
         return yaml.load(text, Loader=_Loader)  # a SafeLoader
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: no {what}, not text: {error}") from error
+        raise InputError(f"{path}: no {what}, because it is not text ({error})") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         where = " ".join(str(error).split()).replace('in "<unicode string>", line', "in line")
-        raise InputError(f"{path}: no {what}, not valid YAML: {where}") from error
+        raise InputError(f"{path}: no {what}, because it is not valid YAML: {where}") from error
 
 
 def as_json(document: Any) -> str:

@@ -31,10 +31,14 @@ PASSES = 3
 class EffectInput:
     """Motion that an effect acts on: the truth in the simulator, its best estimate in the diagnosis.
 
-    time: (N,) s, increasing. velocity_body: (N, 3) m/s over ground of the reference point, forward-left-up.
-    rotation_dvl_from_body: (3, 3) T. rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame;
-    None if not recorded. reference_frame: frame in which the reference velocity was recorded; a delay or filter in that
-    frame rotates with the vehicle only if it is the body. start: s, beginning of the recording; None: the first time.
+    time: (N,) s, increasing.
+    velocity_body: (N, 3) m/s over ground of the reference point, forward-left-up.
+    rotation_dvl_from_body: (3, 3) T.
+    rotation_enu_from_body: (N, 3, 3).
+    angular_velocity: (N, 3) rad/s, body frame; None if not recorded.
+    reference_frame: frame in which the reference velocity was recorded; a delay or filter in that frame rotates with
+      the vehicle only if it is the body.
+    start: s, beginning of the recording; None: the first time.
     """
 
     time: Array
@@ -110,9 +114,11 @@ class ActsOn(Enum):
 class EffectParameter:
     """One parameter of an effect.
 
-    typical: a relevant size, in `unit`. low, high: bounds. default: value if not given; an effect with all defaults
-    does nothing. linear: the trace is linear in it, with the others fixed. said: text displayed before value and unit,
-    '' if the effect's name suffices; None: `name`.
+    typical: a relevant size, in `unit`.
+    low, high: bounds.
+    default: value if not given; an effect with all defaults does nothing.
+    linear: the trace is linear in it, with the others fixed.
+    said: text displayed before value and unit, '' if the effect's name suffices; None: `name`.
     """
 
     name: str
@@ -151,7 +157,9 @@ def vector(values: Mapping[str, float], suffix: str) -> Array:
 class AnyEffect:
     """Base of systematic effects and of effects on the noise.
 
-    name: as in the documentation. parameters: in the order of `values`. needs: data that a recording must have.
+    name: as in the documentation.
+    parameters: in the order of `values`.
+    needs: data that a recording must have.
     confounded_with: effects that some data cannot distinguish from this one.
     """
 
@@ -171,11 +179,13 @@ class AnyEffect:
 class Effect(AnyEffect, ABC):
     """A systematic effect: the same motion always gives the same trace.
 
-    remedy: what to do about it, as part of a sentence. manoeuvre: motion that makes it observable and distinguishes it
-    from confounded effects. per_recording: whether its size differs per recording; else it belongs to the vehicle.
-    relative_to_first: whether it is a change from the first of several recordings. again: parameters of a second
-    occurrence, searched after a first was found -> those of the first. rarer: parameters searched only if several
-    recordings need them. of_velocity: whether the trace depends on the velocity of the motion.
+    remedy: what to do about it, as part of a sentence.
+    manoeuvre: motion that makes it observable and distinguishes it from confounded effects.
+    per_recording: whether its size differs per recording; else it belongs to the vehicle.
+    relative_to_first: whether it is a change from the first of several recordings.
+    again: parameters of a second occurrence, searched after a first was found -> those of the first.
+    rarer: parameters searched only if several recordings need them.
+    of_velocity: whether the trace depends on the velocity of the motion.
     """
 
     remedy: ClassVar[str] = ""
@@ -211,7 +221,7 @@ class Effect(AnyEffect, ABC):
         for name in ("trace", "late", "turn"):  # these methods expect all parameters
             if act := getattr(self, name, None):
                 vars(found)[name] = lambda of, values, act=act: act(of, {**defaults, **values})
-        vars(found)["parameters"] = tuple(each for each in self.parameters if each.name not in names)
+        vars(found)["parameters"] = tuple(parameter for parameter in self.parameters if parameter.name not in names)
         return found
 
     @property
@@ -341,9 +351,9 @@ class Injection:
 def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn) -> Array:
     """Return the sum (N, 3) m/s, body frame, of the systematic effects of one stage."""
     total = np.zeros_like(motion.velocity_body)
-    for each in injections:
-        if isinstance(each.effect, Effect) and each.effect.acts_on is acts_on:
-            total += each.effect.trace(motion, each.values)
+    for injection in injections:
+        if isinstance(injection.effect, Effect) and injection.effect.acts_on is acts_on:
+            total += injection.effect.trace(motion, injection.values)
     return total
 
 
@@ -355,18 +365,18 @@ def at_dvl(injections: Sequence[Injection], motion: EffectInput) -> EffectInput:
 def turns(injections: Sequence[Injection], motion: EffectInput) -> Array:
     """Return (N, 3) rad, or (3,) for all times, of rotation in addition to φ; motion: of the DVL."""
     total = np.zeros(3)
-    for each in injections:
-        if isinstance(each.effect, MountingEffect):
-            total = total + each.effect.turn(motion, each.values)
+    for injection in injections:
+        if isinstance(injection.effect, MountingEffect):
+            total = total + injection.effect.turn(motion, injection.values)
     return total
 
 
 def late(injections: Sequence[Injection], clock: ActsOn, elapsed: Array) -> Array:
     """Return the delay (N,) s of a clock's stamps for measurements at times (N,) s since the start."""
     total = np.zeros(len(elapsed))
-    for each in injections:
-        if isinstance(each.effect, ClockEffect) and each.effect.acts_on is clock:
-            total += each.effect.late(elapsed, each.values)
+    for injection in injections:
+        if isinstance(injection.effect, ClockEffect) and injection.effect.acts_on is clock:
+            total += injection.effect.late(elapsed, injection.values)
     return total
 
 

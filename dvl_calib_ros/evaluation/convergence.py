@@ -1,4 +1,7 @@
-"""Convergence of the misalignment: its error over calibration time, from ten seconds on."""
+"""Convergence of the misalignment: its error over calibration time, from ten seconds on.
+
+Shapes: B combinations of errors, N samples, T points of time.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,9 @@ def squared_errors(
 ) -> Array:
     """Return squared errors of φ on one run (curves, T, 3) rad², averaged over combinations; nan for unusable models.
 
-    measured: (B, N, 3) m/s. references: noise -> (B, N, 3) m/s. failures: receives exceptions.
+    measured: (B, N, 3) m/s.
+    references: noise -> (B, N, 3) m/s.
+    failures: receives exceptions.
     """
     ends = [run.first(seconds) for seconds in TIMES_S]
     cut = slice(0, ends[-1])
@@ -87,7 +92,7 @@ def curves(models: Sequence[str], squares: Array) -> tuple[ConvergenceCurve, ...
 
 
 def curves_document(found: Sequence[ConvergenceCurve]) -> dict[str, Any]:
-    """Return plain data, degrees."""
+    """Return the curves as plain data for JSON, in degrees."""
     return {
         "times_s": list(TIMES_S),
         "published": {"seconds": PUBLISHED_S, "degrees": PUBLISHED_DEG},

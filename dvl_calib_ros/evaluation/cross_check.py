@@ -38,12 +38,18 @@ from .results import Failure, Improvement
 class CrossCheck(Answering):
     """Velocity error (vector RMSE, m/s) of the DVL against GNSS on bags that were not used for calibration.
 
-    The noise of GNSS is included. bags: (L,). models: (M,). n_paired: (L,) samples with a reference. uncorrected: (L,)
-    by verifying bag. corrected: (L, M, L) by calibrating bag, model and verifying bag; nan on the bag itself, without
-    paired samples, and for models without usable data. A model with lever arm and delay corrects both, with the delay
-    estimated from the verifying bag if observable. selected: (L,) model of each calibrating bag for `navigation`.
-    navigation: dead reckoning by (calibrating, verifying) bag. notes: messages of the replays. found: results of
-    discovery.
+    The noise of GNSS is included.
+    bags: (L,).
+    models: (M,).
+    n_paired: (L,) samples with a reference.
+    uncorrected: (L,) by verifying bag.
+    corrected: (L, M, L) by calibrating bag, model and verifying bag; nan on the bag itself, without paired samples, and
+      for models without usable data. A model with lever arm and delay corrects both, with the delay estimated from the
+      verifying bag if observable.
+    selected: (L,) model of each calibrating bag for `navigation`.
+    navigation: dead reckoning by (calibrating, verifying) bag.
+    notes: messages of the replays.
+    found: results of discovery.
     """
 
     bags: tuple[str, ...]
@@ -77,9 +83,13 @@ class CrossCheck(Answering):
 class _Replayed:
     """Replay of one bag. parameters: with the bag's discovered values, described in found.
 
-    corrections: (M, 3, 3), nan for a model without samples. moments: of the paired samples, None without. delayed: by
-    model with a lever arm and delay, if it claims any, its corrections. recording: all streams, thinned. selected:
-    selected model and its corrections; None if it used nothing. dvl: its messages. failed: why there is no result.
+    corrections: (M, 3, 3), nan for a model without samples.
+    moments: of the paired samples, None without.
+    delayed: by model with a lever arm and delay, if it claims any, its corrections.
+    recording: all streams, thinned.
+    selected: selected model and its corrections; None if it used nothing.
+    dvl: its messages.
+    failed: why there is no result.
     """
 
     parameters: Parameters
@@ -109,7 +119,7 @@ def cross_check(
     found = run_all(partial(_replay_or_nothing, parameters, tuple(models), given), bags, workers, on_progress)
     if not any(each.moments for each in found):
         if failed := [f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in each.failed]:
-            raise InputError(f"nothing is left to check: {failed[0]}")
+            raise InputError(f"no bag is left to check: {failed[0]}")
         raise InputError(f"{', '.join(map(str, bags))}: no sample has a reference to check against; set --gnss-topic")
     uncorrected = np.full(len(bags), np.nan)
     corrected = np.full((len(bags), len(models), len(bags)), np.nan)
@@ -166,7 +176,10 @@ def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> 
 
 
 def _navigation(bags: Sequence[Path], found: Sequence[_Replayed]) -> Mapping[tuple[str, str], Navigation]:
-    """Return the dead reckoning of every bag, corrected by every other one's calibration."""
+    """Return the dead reckoning of every bag, corrected by every other bag's calibration.
+
+    Keys are (calibrated bag, verified bag).
+    """
     navigation = {}
     for calibrated, one in zip(bags, found, strict=True):
         for verified, other in zip(bags, found, strict=True):
@@ -193,7 +206,12 @@ def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Giv
 
 
 def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
-    """Replay one bag and collect its corrections and the moments of its paired velocities."""
+    """Replay one bag. Return its corrections, the moments of its paired velocities, and what the cross-check needs.
+
+    named: parameters given by the user, before discovery.
+    models: names of the models whose correction matrices (3, 3) are collected; nan if a model used no sample.
+    given: topics and parameters that discovery must keep.
+    """
     opened = open_recording([bag], None, named)
     discovery = discover(opened, named, given)
     topics, parameters = discovery.topics, discovery.parameters

@@ -2,6 +2,8 @@
 
 B variants of a run (combinations of errors) are aligned and gated like recordings, then processed as one array.
 test_evaluation.py verifies that the states equal those of replayed bags.
+
+Shapes: B variants of a run, N samples, E calibration times, n states.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ _START_S = 1_600_000_000
 class SensorData:
     """Sensor data of a run in B variants. Body frame, forward-left-up; the DVL is mounted without rotation.
 
-    run: true motion, times and attitude. velocity_dvl: (B, N, 3) m/s. reference: (B, N, 3) m/s.
+    run: true motion, times and attitude.
+    velocity_dvl: (B, N, 3) m/s.
+    reference: (B, N, 3) m/s.
     """
 
     run: Trajectory
@@ -51,7 +55,9 @@ class AlignedVariants:
     """B variants of a run of N samples after the calibrator's alignment and gates.
 
     rows: of all variants in sequence (B N). A rejected sample, for example above max_speed, is a row that no model
-    uses. has: for each need the rows (B, N) that satisfy it. sway_heave: (B, 2) m/s, the priors.
+      uses.
+    has: for each need the rows (B, N) that satisfy it.
+    sway_heave: (B, 2) m/s, the priors.
     """
 
     rows: AlignedBlock

@@ -50,8 +50,10 @@ class RunMoments:
     """Second moments of measured velocities v and true ones g of ... runs, sufficient for every VRMSE.
 
     They are for whole runs, many corrections, and a true velocity with all axes. `calibration.folds.Moments` sums by
-    fold, with references that may lack axes. vv: E[v vᵀ] (..., 3, 3). gv: E[g vᵀ] (..., 3, 3). gg: E[gᵀg] (...,).
-    (m/s)².
+      fold, with references that may lack axes.
+    vv: E[v vᵀ] (..., 3, 3).
+    gv: E[g vᵀ] (..., 3, 3).
+    gg: E[gᵀg] (...,). (m/s)².
     """
 
     vv: Array

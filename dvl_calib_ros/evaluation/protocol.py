@@ -111,8 +111,9 @@ LARGEST_ANGLES = np.array([np.pi, np.pi / 2, 2 * np.pi])
 class Trajectory:
     """A recorded run. Body frame forward-left-up.
 
-    time: (N,) s. velocity: (N, 3) m/s over ground, used as truth. rotation_enu_from_body: (N, 3, 3), angular_velocity:
-    (N, 3) rad/s in the body frame, None without attitude.
+    time: (N,) s.
+    velocity: (N, 3) m/s over ground, used as truth.
+    rotation_enu_from_body: (N, 3, 3), angular_velocity: (N, 3) rad/s in the body frame, None without attitude.
     """
 
     name: str
@@ -193,7 +194,7 @@ def _load(folder: Path, name: str, shortest_s: float) -> Trajectory:
     if len(time) < 2 or run.seconds < shortest_s:
         length = run.seconds if len(time) > 1 else 0.0
         raise InputError(
-            f"{path}: ends at row {len(time)} after {length:.0f} s, needs {shortest_s:.0f} s; fetch it whole"
+            f"{path}: ends at row {len(time)} after {length:.0f} s, needs {shortest_s:.0f} s; download the whole file"
         )
     attitude = folder / f"{name}_attitude.csv"
     return _with_attitude(run, attitude) if attitude.is_file() else run
@@ -203,7 +204,7 @@ def _read_whole_file(path: Path, unit: str) -> tuple[Array, Array]:
     """Return time and values of a file without omissions, because the procedure averages over whole files."""
     time, values, left_out = read_columns(path, unit)
     if left_out:
-        raise InputError(f"{left_out[0]}; the procedure takes whole files, fetch it again")
+        raise InputError(f"{left_out[0]}; the procedure needs whole files; download it again")
     return time, values
 
 

@@ -56,14 +56,16 @@ class Improvement(NamedTuple):
         if not self.model:
             return f"Nothing could be calibrated and checked on other {what}."
         error = f"{self.model} leaves a velocity error of {self.after:.3f} m/s rms"
-        return f"On {what} that were not calibrated on {error}; without a calibration, {self.before:.3f}."
+        return f"On the other {what}, {error}; without a calibration, {self.before:.3f}."
 
 
 @dataclass(frozen=True)
 class Failure:
     """An omitted result whose computation raised: one estimate of many, or a whole seed.
 
-    what: a model, a baseline, or another computation. run: trajectory or set. combination, seed: None for all of them.
+    what: a model, a baseline, or another computation.
+    run: trajectory or set.
+    combination, seed: None for all of them.
     why: the exception in one line.
     """
 
@@ -109,8 +111,12 @@ class CalibrationRun:
 class Coverage:
     """Share of errors (estimate - truth) within the model's 68 % and 95 % intervals.
 
-    model: name. state_names: the n error states (nuisance states have no truth). within_68, within_95: (n,) per state.
-    pooled_68, pooled_95: over all states. n_errors: errors per state. mean_error, rms_error, mean_std: (n,).
+    model: name.
+    state_names: the n error states (nuisance states have no truth).
+    within_68, within_95: (n,) per state.
+    pooled_68, pooled_95: over all states.
+    n_errors: errors per state.
+    mean_error, rms_error, mean_std: (n,).
     normalised_rms: rms of error / σ over all states: 1 for a correct σ, larger if σ is too small.
     """
 
@@ -131,8 +137,10 @@ class Coverage:
 class EachStudy:
     """Calibration on each of L runs with attitude, evaluated on all other trajectories.
 
-    runs: (L,). avg_vrmse: (L, C, Q). yaw_observed: (L, M) share of combinations and seeds in which yaw is observable
-    for the model. coverage: per model, over runs, combinations and seeds.
+    runs: (L,).
+    avg_vrmse: (L, C, Q).
+    yaw_observed: (L, M) share of combinations and seeds in which yaw is observable for the model.
+    coverage: per model, over runs, combinations and seeds.
     """
 
     runs: tuple[CalibrationRun, ...]
@@ -163,8 +171,10 @@ class HeldOut:
     """Hold-out verification of one model's calibration on one set.
 
     Velocity error (vector rms, m/s) against the reference, including its noise, on samples that the calibration did not
-    use. uncorrected, corrected, predicted: rms over combinations of errors. verdict: the most frequent one. verdicts:
-    count of each.
+      use.
+    uncorrected, corrected, predicted: rms over combinations of errors.
+    verdict: the most frequent one.
+    verdicts: count of each.
     """
 
     set_name: str
@@ -207,12 +217,21 @@ class ConvergenceCurve:
 class Evaluation(Answering):
     """Result of the published procedure and the studies around it.
 
-    source: folder or generator, as text. own_generator: whether the trajectories are simulated, so that the published
-    figures do not apply. notes: warnings. columns: `UNCALIBRATED`, then the models. avg_vrmse: (S, C, Q). windows_s:
-    (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column -> m/s. coverage: over the sets.
-    coverage_of_all: over these and the runs of `each`. parameters: plain values. baselines: (S,) Avg.VRMSE of earlier
-    methods, by name. convergence: error of the misalignment over time. failures: exceptions; their results are
-    excluded. version: of the software.
+    source: folder or generator, as text.
+    own_generator: whether the trajectories are simulated, so that the published figures do not apply.
+    notes: warnings.
+    columns: `UNCALIBRATED`, then the models.
+    avg_vrmse: (S, C, Q).
+    windows_s: (W,), None is all.
+    avg_vrmse_by_time: (S, W, C, Q).
+    published: set -> column -> m/s.
+    coverage: over the sets.
+    coverage_of_all: over these and the runs of `each`.
+    parameters: plain values.
+    baselines: (S,) Avg.VRMSE of earlier methods, by name.
+    convergence: error of the misalignment over time.
+    failures: exceptions; their results are excluded.
+    version: of the software.
     """
 
     source: str

@@ -1,4 +1,7 @@
-"""The published procedure over many noise seeds, with hold-out verdicts."""
+"""The published procedure over many noise seeds, with hold-out verdicts.
+
+Shapes: B combinations of errors, E calibration times, C columns: the uncalibrated DVL and the models.
+"""
 
 from __future__ import annotations
 
@@ -61,9 +64,9 @@ class Procedure:
 class RunOutcome:
     """Result of calibrating on one run (B combinations); nan for unusable models.
 
-    by_time: (E, C) Avg.VRMSE m/s after each window. The others are after the run's own window: avg_vrmse (C,). errors,
-    std: model -> (B, n) estimate - truth of the error states, and the claimed σ. yaw_observed: (M,) share of
-    combinations.
+    by_time: (E, C) Avg.VRMSE m/s after each window. The others are after the run's own window: avg_vrmse (C,).
+    errors, std: model -> (B, n) estimate - truth of the error states, and the claimed σ.
+    yaw_observed: (M,) share of combinations.
     """
 
     by_time: Array
@@ -77,9 +80,10 @@ class RunOutcome:
 class SeedOutcome:
     """Result of one seed. by_set: one per set, E are the windows of `protocol.WINDOWS_S`.
 
-    each, single_heading: one per run of `each_runs` and `single_headings`. baselines: (S, K) Avg.VRMSE of
-    `baselines.BASELINES`. convergence: (L, curves, T, 3) squared errors of the misalignment over time on each run, see
-    `convergence`. failures: exceptions, whose results are nan.
+    each, single_heading: one per run of `each_runs` and `single_headings`.
+    baselines: (S, K) Avg.VRMSE of `baselines.BASELINES`.
+    convergence: (L, curves, T, 3) squared errors of the misalignment over time on each run, see `convergence`.
+    failures: exceptions, whose results are nan.
     """
 
     by_set: tuple[RunOutcome, ...]

@@ -30,7 +30,7 @@ from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_messages import Recorded
-from ..recordings.topic_preview import Look
+from ..recordings.topic_preview import Preview
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding, full, is_cause
@@ -71,7 +71,9 @@ class Content:
 class Examination(Answering):
     """Result of the doctor.
 
-    judged: verdict of a replay, which decides. reasons: of that verdict. cannot: why there is no replay, else ''.
+    judged: verdict of a replay, which decides.
+    reasons: of that verdict.
+    cannot: why there is no replay, else ''.
     """
 
     paths: tuple[Path, ...]
@@ -97,21 +99,21 @@ class Examination(Answering):
         if self.judged is Severity.REJECT:
             return "no"
         # the angles that rotate and lift a track
-        needed = [each for each in self.shown if each.name in ("pitch", "yaw")]
-        all_shown = bool(needed) and not any(each.needs for each in needed)
+        needed = [reason for reason in self.shown if reason.name in ("pitch", "yaw")]
+        all_shown = bool(needed) and not any(reason.needs for reason in needed)
         return "yes" if self.judged is Severity.ACCEPT and all_shown else "partly"
 
     @property
     def against(self) -> tuple[Reason, ...]:
         """Reasons of the replay's verdict against its calibration."""
-        return tuple(each for each in self.reasons if each.severity in (Severity.REJECT, Severity.MARGINAL))
+        return tuple(reason for reason in self.reasons if reason.severity in (Severity.REJECT, Severity.MARGINAL))
 
     @property
     def why(self) -> str:
         """Sentence on why it cannot calibrate fully; '' if it can or the findings explain it."""
         if self.verdict == "no" and self.against and is_cause(self.against[0]):
             return self.against[0].full_sentence
-        errors = [each for each in self.findings if each.severity is Severity.ERROR]
+        errors = [reason for reason in self.findings if reason.severity is Severity.ERROR]
         if errors:
             return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
         if not self.has_reference and self.verdict != "no":
@@ -119,7 +121,7 @@ class Examination(Answering):
         if self.cannot or self.verdict == "no":
             why = self.cannot or self.against[0].says
             return full(why)
-        missing = [each.name for each in self.shown if each.needs]
+        missing = [reason.name for reason in self.shown if reason.needs]
         listed = " and ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:])))
         return f"Not shown yet: {listed}." if listed else ""
 
@@ -127,7 +129,7 @@ class Examination(Answering):
         """Return plain data for JSON."""
         return {
             "verdict": self.verdict,
-            "replay": {"verdict": self.judged.value, "reasons": [each.as_dict() for each in self.reasons]},
+            "replay": {"verdict": self.judged.value, "reasons": [reason.as_dict() for reason in self.reasons]},
             "seconds": self.seconds,
             "topics": {
                 content.role.lower(): {
@@ -144,8 +146,8 @@ class Examination(Answering):
             "findings": [found.as_dict() for found in self.findings],
             "speed_mps": self.speed_mps,
             "shown": {
-                each.name: {"std": each.std, "unit": each.unit, "share": each.share, "needs": each.needs}
-                for each in self.shown
+                reason.name: {"std": reason.std, "unit": reason.unit, "share": reason.share, "needs": reason.needs}
+                for reason in self.shown
             },
             "notes": list(self.notes),
         }
@@ -157,27 +159,29 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         recording = open_recording(recording, parameters=parameters)
     discovery = discover(recording, parameters, given)
     streams = _streams(recording, discovery)
-    looks = {role: recording.survey.looks.get(each.topic) for role, each in streams.items()}
+    previews = {role: recording.survey.previews.get(topic.topic) for role, topic in streams.items()}
     start_ns, end_ns = recording.span_ns
     recorded_s = 1e-9 * (end_ns - start_ns)
-    seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
-    velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
+    seconds = {
+        role: recorded_s * (1.0 if preview is None else preview.clock_rate) for role, preview in previews.items()
+    }
+    velocity = _body_velocity(streams["dvl"], previews["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
     replayed, cannot = _replayed(recording, discovery)
     verification = None if replayed is None else replayed.result.verifications[replayed.result.selected]
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
     reasons = () if verification is None else tuple(verification.reasons)
-    said = set(map(str, reasons))
-    findings = [each for each in findings if str(each.numbers.get("says")) not in said]  # said once
+    in_verdict = set(map(str, reasons))
+    findings = [reason for reason in findings if str(reason.numbers.get("says")) not in in_verdict]
     judged = Severity.REJECT if verification is None else verification.verdict
     if judged is not Severity.REJECT:  # the replay is usable, so no finding prevents a calibration
-        findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]
+        findings = [reason.weighed(Severity.WARNING) if _has_error([reason]) else reason for reason in findings]
     return Examination(
         recording.paths,
         seconds["dvl"],
         tuple(
-            _content(role, topic, looks[role], recording.counts[topic.topic] / (seconds[role] or math.inf))
+            _content(role, topic, previews[role], recording.counts[topic.topic] / (seconds[role] or math.inf))
             for role, topic in streams.items()
         ),
         discovery,
@@ -228,9 +232,9 @@ def judged_replay(
     if judged is None or judged.verdict is not Severity.REJECT or is_cause(judged.reasons[0]):
         return replayed
     streams = _streams(recording, discovery)
-    look = recording.survey.looks.get(streams["dvl"].topic)
+    look = recording.survey.previews.get(streams["dvl"].topic)
     findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
-    errors = [each for each in findings if _has_error([each])]
+    errors = [reason for reason in findings if _has_error([reason])]
     if not errors or errors[0].code.startswith(NO_IMU):  # that there is no IMU is said before the verdict
         return replayed
     judged = judged.with_objections([errors[0].weighed(Severity.REJECT)])
@@ -254,7 +258,7 @@ def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | No
         return None, str(error).rstrip(".")
 
 
-def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> Content:
+def _content(role: str, topic: Recorded, look: Preview | None, rate_hz: float) -> Content:
     """Return name, type, rate and reported σ of a topic, as text."""
     variances = topic.variances[np.isfinite(topic.variances).all(axis=1)]
     if role == "imu":
@@ -277,7 +281,7 @@ def _claimed(variances: Array, window_s: float) -> str:
     return f"{window_s * math.sqrt(0.5 * float(np.median(variances))):.2g} m"
 
 
-def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> Array:
+def _body_velocity(dvl: Recorded, look: Preview | None, parameters: Parameters) -> Array:
     """Return the DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
@@ -287,7 +291,10 @@ def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> 
 
 
 def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Reason]:
-    """Return all problems of the streams, errors first; consequences of a reported problem are left out."""
+    """Return all problems of the streams, errors first; consequences of a reported problem are left out.
+
+    velocity: (N, 3) m/s, of the DVL in the body.
+    """
     dvl, reference, imu = streams["dvl"], streams.get("reference"), streams.get("imu")
     over_legs = reference is not None and _is_compared_over_legs(reference)
     found: list[Reason] = []
@@ -334,8 +341,8 @@ def _is_compared_over_legs(reference: Recorded) -> bool:
     return is_position and (is_noisy or topic_checks.interval_s(reference) > SELDOM_S)
 
 
-def _has_error(found: Sequence[Reason]) -> bool:
-    return any(each.severity is Severity.ERROR for each in found)
+def _has_error(reasons: Sequence[Reason]) -> bool:
+    return any(reason.severity is Severity.ERROR for reason in reasons)
 
 
 def _units(dvl: Recorded, reference: Recorded) -> list[Reason]:
@@ -376,7 +383,8 @@ _NAMES = ("roll", "pitch", "yaw", "scale")
 class Shown:
     """Observability of one error in a recording.
 
-    std: standard deviation of the calibration, degrees or per cent. share: progress from no knowledge (0) to fine (1).
+    std: standard deviation of the calibration, degrees or per cent.
+    share: progress from no knowledge (0) to fine (1).
     needs: the manoeuvre that improves it, '' if it is observable.
     """
 
@@ -393,17 +401,17 @@ def _observability(replayed: Replayed) -> tuple[Shown, ...]:
     if not result.estimate.used:
         return ()
     parameters = Parameters.from_mapping(result.parameters)
-    return tuple(_one_shown(each, result.estimate, parameters) for each in quantities(result) if each.name in _NAMES)
+    return tuple(_one_shown(term, result.estimate, parameters) for term in quantities(result) if term.name in _NAMES)
 
 
-def _one_shown(found: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
+def _one_shown(quantity: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
     """Return one quantity with its σ, progress to the goal, and the missing motion."""
-    if found.name == "scale":
+    if quantity.name == "scale":
         unit, prior = 100.0, parameters.initial_std_scale
     else:
         unit, prior = math.degrees(1.0), parameters.initial_std_misalignment
-    missing = (each.missing for each in estimate.observability if each.axis == found.name and each.missing)
-    needs = "" if found.shown else next(missing, MODELS[estimate.model].shown_by[found.name])
+    missing = (entry.missing for entry in estimate.observability if entry.axis == quantity.name and entry.missing)
+    needs = "" if quantity.shown else next(missing, MODELS[estimate.model].shown_by[quantity.name])
     fine = PredictedDrift.goals(parameters).side / KM
-    way = math.log(prior * unit / max(found.std, 1e-12)) / max(math.log(prior / fine), 1e-9)
-    return Shown(found.name, found.unit.strip(), found.std, min(1.0, max(0.0, way)), needs)
+    way = math.log(prior * unit / max(quantity.std, 1e-12)) / max(math.log(prior / fine), 1e-9)
+    return Shown(quantity.name, quantity.unit.strip(), quantity.std, min(1.0, max(0.0, way)), needs)

@@ -83,7 +83,10 @@ def stamp_findings(topic: Recorded, stream: Stream, parameters: Parameters) -> l
 
 
 def _reception(name: str, steps: Array, log_steps: Array) -> list[Reason]:
-    """Report stamps with the jitter of the reception around the sensor's steady rhythm."""
+    """Report stamps with the jitter of the reception around the sensor's steady rhythm.
+
+    steps, log_steps: (N - 1,) s, between successive stamps and between successive log times.
+    """
     period = float(np.median(steps))
     steady = (steps > 0.3 * period) & (steps < 1.7 * period)
     if period <= 0.0 or steady.sum() < ENOUGH:
@@ -116,7 +119,7 @@ def apart_findings(dvl: Recorded, reference: Recorded) -> list[Reason]:
 
 
 def gap_findings(topic: Recorded) -> list[Reason]:
-    """Report gaps, by log time."""
+    """Report the gaps between the log times of a topic: their total length, number, and the longest."""
     if len(topic) < ENOUGH:
         return []
     steps = np.diff(topic.log_ns) * 1e-9
@@ -168,7 +171,10 @@ def shown_noise(values: Array) -> float:
 
 
 def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Reason]:
-    """Report a constant covariance that the data contradict."""
+    """Report a constant covariance that the data contradict.
+
+    used: (K,) indices of the valid messages.
+    """
     variances = topic.variances[used]
     if np.isnan(variances).any() or (variances != variances[0]).any():
         return []

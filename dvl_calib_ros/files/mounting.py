@@ -47,12 +47,15 @@ FUSION_NODE = "ekf_filter_node"
 class CalibratedMounting:
     """The selected model's calibration in a result file.
 
-    rotation_body_from_dvl (3, 3): corrected, of the calibrated forward-left-up axes. turned: whether the driver's data,
-    in dvl_frame, are forward-right-down and were converted to them. position: (3,) m in the body, None if unknown.
-    scale (3,): δk per DVL axis, 0 if not estimated. lever_arm (3,): m from the reference point, body frame, estimated
-    or configured. dvl_time_offset: delay, s, estimated or configured. objections: reasons not to apply it. doubts:
-    warnings when it is applied; both in sentences. water: its properties, and cause_of_scale: the scale explained by
-    them; None if unknown.
+    rotation_body_from_dvl (3, 3): corrected, of the calibrated forward-left-up axes.
+    turned: whether the driver's data, in dvl_frame, are forward-right-down and were converted to them.
+    position: (3,) m in the body, None if unknown.
+    scale (3,): δk per DVL axis, 0 if not estimated.
+    lever_arm (3,): m from the reference point, body frame, estimated or configured.
+    dvl_time_offset: delay, s, estimated or configured.
+    objections: reasons not to apply it.
+    doubts: warnings when it is applied; both in sentences.
+    water: its properties, and cause_of_scale: the scale explained by them; None if unknown.
     """
 
     path: Path
@@ -195,16 +198,16 @@ def _objections_and_doubts(
 
 def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[str, ...]:
     """Return the warnings of these severities that the node saved with its calibration."""
-    wanted = {each.value for each in severities}
-    return tuple(str(each["says"]) for each in content.get("doubts", ()) if each["severity"] in wanted)
+    wanted = {severity.value for severity in severities}
+    return tuple(str(doubt["says"]) for doubt in content.get("doubts", ()) if doubt["severity"] in wanted)
 
 
 def _unobservable_angles(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
     """Return a sentence with 1 σ for each angle that was not observable."""
-    entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
+    entries = [entry for entry in observability(model, state.p, parameters)[:3] if not entry.observed]
     return tuple(
-        f"{each.name} ({each.axis}) was not observable in the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
-        for each in entries
+        f"{entry.name} ({entry.axis}) was not observable in the data, which leaves ±{math.degrees(entry.std):.1f}° (1σ)"
+        for entry in entries
     )
 
 
@@ -227,8 +230,8 @@ def calibrated_urdf(
     initial = calibrated.parameters.rotation_dvl_from_body.T
     if calibrated.turned and current[:, 2] @ initial[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
         corrected, initial = corrected @ FLU_FROM_FRD, initial @ FLU_FROM_FRD
-    known = None if keep_position or calibrated.position is None else np.array(calibrated.position)
-    position = mounting.position if known is None else known
+    is_kept = keep_position or calibrated.position is None
+    position = mounting.position if is_kept else np.array(calibrated.position)
     tolerance = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # a configured position may be rounded
     is_placed = np.abs(mounting.position - position).max() < tolerance
     if angle_between(current, corrected) < ALREADY and is_placed:
@@ -237,8 +240,8 @@ def calibrated_urdf(
         raise InputError(
             f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(current))} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
-            f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
-            "or write the calibrated one anyway with --force"
+            f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's mounting (dvl-calib parameters "
+            "--urdf), or write the calibrated mounting anyway with --force"
         )
     began_at = np.array(calibrated.parameters.lever_arm) + calibrated.parameters.reference_position
     if not is_placed and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
@@ -267,14 +270,14 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
             f"{path}: sets initial_calibration, whose angles are relative to the previous mounting; remove it first"
         )
     for name, value in values.items():
-        now, begun_with = getattr(in_file, name), getattr(calibrated.parameters, name)
-        known = [np.array(each) for each in (getattr(default, name), begun_with, value)]
+        now, initial = getattr(in_file, name), getattr(calibrated.parameters, name)
+        expected = [np.array(values) for values in (getattr(default, name), initial, value)]
         within = SAME_POSITION if name == "lever_arm" else SAME_MOUNTING
-        if not any(np.allclose(now, each, rtol=0.0, atol=within) for each in known) and not force:
+        if not any(np.allclose(now, allowed, rtol=0.0, atol=within) for allowed in expected) and not force:
             raise InputError(
                 f"{path}: sets {name} to {as_yaml(in_file.as_dict()[name])}, but {calibrated.path} began with "
-                f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's, or write the calibrated "
-                "one anyway with --force"
+                f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's value, or write "
+                "the calibrated value anyway with --force"
             )
     return with_parameters(path, values)
 
@@ -419,10 +422,13 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
 class Targets:
     """Files to write a calibration into; None for no file.
 
-    urdf: its DVL joint is rotated and moved. output: URDF to write instead. joint: the DVL's joint; None: the one above
-    the DVL's frame. keep_position: keep its xyz. params: parameter file of the node. launch: launch file (XML) with a
-    static transform. fusion: parameters of robot_localization (YAML). Raises InputError for options that need a URDF
-    without one.
+    urdf: its DVL joint is rotated and moved.
+    output: URDF to write instead.
+    joint: the DVL's joint; None: the one above the DVL's frame.
+    keep_position: keep its xyz.
+    params: parameter file of the node.
+    launch: launch file (XML) with a static transform.
+    fusion: parameters of robot_localization (YAML). Raises InputError for options that need a URDF without one.
     """
 
     urdf: Path | None = None
@@ -448,9 +454,11 @@ class Targets:
 class Applied:
     """Result of applying a calibration.
 
-    written: new or changed files, also planned ones. unchanged: files that already had the values. kept: path of each
-    replaced file's backup. notes: remarks for users of the files. changes: planned changes of a dry run, as a unified
-    diff.
+    written: new or changed files, also planned ones.
+    unchanged: files that already had the values.
+    kept: path of each replaced file's backup.
+    notes: remarks for users of the files.
+    changes: planned changes of a dry run, as a unified diff.
     """
 
     written: tuple[Path, ...]

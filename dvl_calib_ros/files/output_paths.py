@@ -39,7 +39,7 @@ def check_outputs(files: Mapping[str, Path], inputs: Iterable[Path], folders: Ma
                 raise InputError(f"{option} {output.path}: would write over the input {path}, or into it; name another")
     for (one, a), (other, b) in combinations(written.items(), 2):
         if a.meets(b):
-            raise InputError(f"{one} and {other}: both name {b.path}, or its backup; give them names of their own")
+            raise InputError(f"{one} and {other}: both write {b.path} or its backup; give each a name of its own")
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,13 @@ class _Written:
 
         Many file systems do not distinguish upper and lower case, or two forms of an accented letter.
         """
-        mine, others = ([_entry(_folded(place)) for place in each.places] for each in (self, other))
+        mine, others = ([_entry(_folded(path)) for path in written.places] for written in (self, other))
         if not set(mine).isdisjoint(others) or not self.files.isdisjoint(other.files):
             return True
-        below = [{_entry(_folded(up)) for up in _parents(each.places[0])} for each in (self, other) if each.places]
-        return len(below) == 2 and (mine[0] in below[1] or others[0] in below[0])
+        if not mine or not others:
+            return False
+        above_mine, above_others = (set(map(_entry, map(_folded, _parents(one.places[0])))) for one in (self, other))
+        return mine[0] in above_others or others[0] in above_mine
 
 
 _Identity = tuple[int, int]

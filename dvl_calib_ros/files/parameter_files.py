@@ -28,10 +28,7 @@ MISSPELT = 0.8
 
 
 def load_parameters(
-    path: Path | None,
-    overrides: Sequence[str] = (),
-    defaults: Mapping[str, Any] | None = None,
-    text: str | None = None,
+    path: Path | None, overrides: Sequence[str] = (), defaults: Mapping[str, Any] | None = None, text: str | None = None
 ) -> Parameters:
     """Load parameters from a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
 
@@ -91,7 +88,7 @@ def _in_radians(value: Any) -> Any:
     if isinstance(value, str):
         parts = re.sub(r"\s+(?=deg|°)", "", value).replace(",", " ").split()
         return [_number_or_degrees(part) for part in parts] if len(parts) > 1 else _number_or_degrees(value)
-    return [_number_or_degrees(each) for each in value] if isinstance(value, list) else value
+    return [_number_or_degrees(element) for element in value] if isinstance(value, list) else value
 
 
 def _number_or_degrees(value: Any) -> Any:
@@ -146,7 +143,7 @@ def _own_sections(
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
     if not own_sections:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
-        raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
+        raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; name '/**:' or the node")
     return [(name, _flattened(body)) for name, body in own_sections]
 
 

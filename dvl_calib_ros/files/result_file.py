@@ -123,7 +123,7 @@ def result_document(
         },
         **({} if verification is None else {"verification": verification_document(verification)}),
         **({"suggestion": result.suggestion.sentence} if result.suggestion else {}),
-        **({"doubts": [each.as_dict() for each in result.doubts]} if result.doubts else {}),
+        **({"doubts": [doubt.as_dict() for doubt in result.doubts]} if result.doubts else {}),
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
         "selected": [{"from_ns": segment.from_ns, "model": segment.model} for segment in result.segments],
         **days_document(result),
@@ -133,7 +133,7 @@ def result_document(
         "std": _std_in_words(estimate, estimate.std),
         "std_of_recording": _std_in_words(estimate, estimate.recording_std),
         "std_by_filter": _std_in_words(estimate, estimate.filter_std),
-        "models": {name: estimate_document(each) for name, each in result.estimates.items()},
+        "models": {name: estimate_document(estimate) for name, estimate in result.estimates.items()},
         _END: True,
     }
 
@@ -160,23 +160,24 @@ def days_document(result: Result) -> dict[str, Any]:
 
 def _found_quantities(result: Result) -> dict[str, str]:
     """Return each quantity with its σ, and which configured values the model does not estimate."""
-    found = {each.name: _in_words(each) for each in quantities(result)}
+    found = {quantity.name: _in_words(quantity) for quantity in quantities(result)}
     configured = {"lever arm": result.parameters["lever_arm"], LATE: [result.parameters["dvl_time_offset"]]}
     for (name, values), unit in zip(configured.items(), ("m", "s"), strict=True):
-        if not any(each.startswith(name) for each in found):
+        if not any(quantity.startswith(name) for quantity in found):
             found[name] = f"{' '.join(f'{value + 0.0:g}' for value in values)} {unit} as configured, not estimated"
     return found
 
 
-def _in_words(found: Quantity) -> str:
-    unit = found.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
-    return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not observable in this data)")
+def _in_words(quantity: Quantity) -> str:
+    unit = quantity.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
+    remark = "" if quantity.shown else " (not observable in this data)"
+    return f"{quantity.value:.2f} +- {quantity.std:.2f} {unit}{remark}"
 
 
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
     """Return 1 σ of each state with its unit, by the state's name."""
     units = {"phi": (math.degrees(1.0), "deg"), "delta": (100.0, "%")}
-    known = {each.name: (1.0, each.unit) for each in MODELS[estimate.model].nuisance}
+    known = {spec.name: (1.0, spec.unit) for spec in MODELS[estimate.model].nuisance}
     words = {}
     for name, std in zip(estimate.state_names, stds.tolist(), strict=True):
         factor, unit = known.get(name) or units[name.partition("_")[0]]
@@ -222,7 +223,9 @@ def check_in_folder(path: Path, folder: Path) -> None:
     This is for names set at run time: permission to set a parameter must not include writing to any file.
     """
     if path.suffix != ".yaml" or Path(os.path.realpath(path)).parent != Path(os.path.realpath(folder)):
-        raise InputError(f"{path}: at run time only a .yaml file in {folder} can be named; name others at the start")
+        raise InputError(
+            f"{path}: a running node accepts only a .yaml file in {folder}; name other files when it starts"
+        )
 
 
 def save_result(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> None:
@@ -273,20 +276,20 @@ def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
     """
     try:
         before: Any = load_yaml(path, "result file")
-        ranks = [_QUALITIES.index(_quality(each)) for each in (before, document)]
-        old, new = (each["mounting"] for each in (before, document))
-        p_old, p_new = (_covariance_of_angles(each) for each in (old, new))
-        rotations = [rotation_from_rpy(each["corrected_rpy"]) for each in (old, new)]
+        old_rank, new_rank = _QUALITIES.index(_quality(before)), _QUALITIES.index(_quality(document))
+        old, new = before["mounting"], document["mounting"]
+        p_old, p_new = _covariance_of_angles(old), _covariance_of_angles(new)
+        old_rotation, new_rotation = rotation_from_rpy(old["corrected_rpy"]), rotation_from_rpy(new["corrected_rpy"])
         same = all(old[name] == new[name] for name in ("nominal_rpy", "frame_id", "child_frame_id"))
         continued = _ResultValue.of(before).continued_by(_ResultValue.of(document))
         both = np.flatnonzero((np.diag(p_old) > 0.0) & (np.diag(p_new) > 0.0))
-        turn, p = turn_between(*rotations)[both], (p_old + p_new)[np.ix_(both, both)]
+        turn, p = turn_between(old_rotation, new_rotation)[both], (p_old + p_new)[np.ix_(both, both)]
         moved = bool(len(both)) and chi2_sf(float(turn @ np.linalg.solve(p, turn)), len(both)) < MOVED
     except (InputError, OSError, LookupError, TypeError, ValueError, OverflowError):
         return None  # no result file, or a damaged one
-    if not same or ranks[0] < ranks[1] or not before["used"]:
+    if not same or old_rank < new_rank or not before["used"]:
         return None
-    if ranks[0] > ranks[1]:
+    if old_rank > new_rank:
         return before
     return before if not continued and not moved and _angle_spread(p_new) > _angle_spread(p_old) else None
 
@@ -309,7 +312,7 @@ def _quality(document: Mapping[str, Any]) -> str:
     """Return the verdict of a result; no observable angle and rejecting warnings take precedence."""
     if document["convergence"] == Convergence.COLLECTING.value:
         return "collecting"
-    if any(each["severity"] == Severity.REJECT.value for each in document.get("doubts", ())):
+    if any(doubt["severity"] == Severity.REJECT.value for doubt in document.get("doubts", ())):
         return Severity.REJECT.value
     return str(document["verification"]["verdict"]) if "verification" in document else "not verified"
 
@@ -329,7 +332,7 @@ class _ResultValue:
 
     @staticmethod
     def of(document: Mapping[str, Any]) -> _ResultValue:
-        rank = [each.value for each in Convergence].index(document["convergence"])
+        rank = [state.value for state in Convergence].index(document["convergence"])
         return _ResultValue(int(document["used"]), rank, document["time_span"]["first_ns"])
 
     @staticmethod
@@ -356,10 +359,10 @@ def _backups_to_keep(new: _ResultValue, n_backups: int, before: Sequence[Path]) 
             continue
         kept.append(path)
         new = current or new
-    first, rest = kept[:1], kept[1:]
-    rest.sort(key=lambda path: -1 if (current := worth[path]) is None else current.convergence, reverse=True)  # stable
-    best = rest[: n_backups - len(first)]
-    return [*first, *(path for path in before if path in best)]
+    newest, older = kept[:1], kept[1:]
+    older.sort(key=lambda path: -1 if (current := worth[path]) is None else current.convergence, reverse=True)  # stable
+    best = older[: n_backups - len(newest)]
+    return [*newest, *(path for path in before if path in best)]
 
 
 def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = None) -> dict[str, GaussianState]:

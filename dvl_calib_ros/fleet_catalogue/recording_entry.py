@@ -89,11 +89,11 @@ class StoredRecording:
         with tempfile.TemporaryDirectory(prefix="dvl_calib_fleet_") as folder:
             store = _open_store(self.where)[0]
             target = Path(folder) / PurePosixPath(self.where).name
-            is_folder = [each.where for each in self.files] != [self.where]
+            is_folder = [file.where for file in self.files] != [self.where]
             if is_folder:
                 target.mkdir()
-            for each in self.files:
-                store.get_file(each.where, str(target / PurePosixPath(each.where).name if is_folder else target))
+            for file in self.files:
+                store.get_file(file.where, str(target / PurePosixPath(file.where).name if is_folder else target))
             yield target
 
 
@@ -123,8 +123,8 @@ def recordings_in(places: Sequence[str]) -> tuple[list[StoredRecording], list[st
     unread: list[str] = []
     for place in places:
         files = _local_files(place, unread) if "://" not in place or place.startswith("file://") else _in_store(place)
-        for each in _group_into_recordings(*files):
-            found.setdefault(each.where, each)
+        for recording in _group_into_recordings(*files):
+            found.setdefault(recording.where, recording)
     if not found:
         raise InputError(f"{', '.join(places)}: no recording (.mcap, .db3, .bag) there or below; name another place")
     return [found[where] for where in sorted(found)], unread
@@ -217,7 +217,7 @@ def _group_into_recordings(place: str, folders: Mapping[str, Sequence[StoredFile
     for folder, files in sorted(folders.items()):
         if any(folder.startswith(f"{bag}/") for bag in bags[-1:]):
             continue  # a folder inside a bag is part of it
-        storage = [each for each in files if storage_suffix(Path(each.where)) in STORAGE_SUFFIXES]
+        storage = [file for file in files if storage_suffix(Path(file.where)) in STORAGE_SUFFIXES]
         if not storage:
             continue
         inside = folder[len(place) :].strip("/")
@@ -233,10 +233,10 @@ def _group_into_recordings(place: str, folders: Mapping[str, Sequence[StoredFile
 
 def _is_bag(folder: str, files: Sequence[StoredFile], storage: Sequence[StoredFile]) -> bool:
     """Return whether a folder has rosbag2's metadata, or only files numbered as rosbag2 does."""
-    if any(each.where.endswith(f"/{METADATA}") for each in files):
+    if any(file.where.endswith(f"/{METADATA}") for file in files):
         return True
     numbered = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
-    return all(numbered.match(each.where.rpartition("/")[2]) for each in storage)
+    return all(numbered.match(file.where.rpartition("/")[2]) for file in storage)
 
 
 _UNITS = {"°": "deg"}
@@ -320,7 +320,7 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
         "used": estimate.used,
         "gated": estimate.gated,
         "verdict": verification.verdict.value,
-        "codes": [each.code for each in verification.reasons],
+        "codes": [reason.code for reason in verification.reasons],
         "reason": verification.reasons[0].full_sentence if verification.reasons else "",
         "drift_before": math.nan if drift is None else drift.before.per_km,
         "drift_after": math.nan if drift is None else drift.after.per_km,
@@ -328,13 +328,13 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
     if result.first_ns is not None and result.last_ns is not None:
         common |= {"first_ns": result.first_ns, "last_ns": result.last_ns}
         common["day"] = _day(result.first_ns)
-    extrinsics, without_day = (extrinsics_of_replay(each, where) for each in (replayed, _without_day(replayed)))
+    extrinsics, without_day = (extrinsics_of_replay(variant, where) for variant in (replayed, _without_day(replayed)))
     extrinsics_row = None
     if extrinsics is not None and without_day is not None:
         extrinsics_row = {**_plain_data(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
         extrinsics_row |= _cause(replayed)
     rows = (*_quantities(result), *_heading(estimate), *_water(replayed.water))
-    return Entry([common | each for each in rows], extrinsics_row)
+    return Entry([common | row for row in rows], extrinsics_row)
 
 
 def _day(stamp_ns: int) -> date | None:

@@ -67,6 +67,7 @@ class Catalogue:
     """
 
     def __init__(self, folder: Path):
+        """Create the folder, and define the columns of its files."""
         self._arrow = _arrow()
         self.folder = folder
         self.notes: list[str] = []
@@ -258,7 +259,7 @@ class Fleet(Answering):
     @property
     def word(self) -> str:
         """The answer: whether any mounting moved."""
-        words = [each.compared.word for each in self.vehicles if each.compared is not None]
+        words = [vehicle.compared.word for vehicle in self.vehicles if vehicle.compared is not None]
         return next((word for word in WORDS if word in words), "not compared")
 
 
@@ -273,27 +274,28 @@ def run_fleet(
 ) -> Fleet:
     """Calibrate new and changed recordings, and read the catalogue. The page is not written.
 
-    places: folders, files, URLs. given: named parameters and topics. vehicle_from: a regular expression; by default the
-    first folder below a place. Raises InputError for an invalid place, a catalogue that cannot be written, and
-    unavailable workers; finished recordings are kept.
+    places: folders, files, URLs.
+    given: named parameters and topics.
+    vehicle_from: a regular expression; by default the first folder below a place. Raises InputError for an invalid
+      place, a catalogue that cannot be written, and unavailable workers; finished recordings are kept.
     """
     if parameters.initial_calibration:
         raise InputError("initial_calibration: recordings of a fleet are each calibrated by themselves; leave it out")
     pattern = vehicle_pattern(vehicle_from)
     recordings, notes = recordings_in(places)
-    check_outputs({}, [Path(each.where) for each in recordings if not each.is_remote], {"--out": out})
+    check_outputs({}, [Path(recording.where) for recording in recordings if not recording.is_remote], {"--out": out})
     catalogue = Catalogue(out)
     options = _options(parameters, given)
     known = {part.recording: part for part in catalogue.parts()}
     to_do = []
-    for each in recordings:
-        vehicle, part = each.vehicle(pattern), known.get(each.name)
-        if part is None or part.fingerprint != _fingerprint(each, options):
-            to_do.append(each)
+    for recording in recordings:
+        vehicle, part = recording.vehicle(pattern), known.get(recording.name)
+        if part is None or part.fingerprint != _fingerprint(recording, options):
+            to_do.append(recording)
         elif part.vehicle != vehicle:
             catalogue.rename(part, vehicle)
     _check_reach(to_do, workers)
-    tasks = [Task(each, parameters, given) for each in to_do]
+    tasks = [Task(recording, parameters, given) for recording in to_do]
     for number, (index, entry) in enumerate(outcomes_as_done(entry_of, tasks, workers), start=1):
         each = to_do[index]
         if isinstance(entry, Lost):
@@ -324,9 +326,9 @@ def _read_catalogue(catalogue: Catalogue, calibrated: int, unchanged: int, notes
 
 def _check_reach(remaining: Sequence[StoredRecording], workers: Workers) -> None:
     """Raise InputError for files that other processes cannot read."""
-    for each in remaining:
-        if each.where.startswith("memory://") and (workers.dask or workers.jobs != 1):
-            raise InputError(f"{each.where}: is in the memory of this process alone; read it with --jobs 1")
+    for recording in remaining:
+        if recording.where.startswith("memory://") and (workers.dask or workers.jobs != 1):
+            raise InputError(f"{recording.where}: is in the memory of this process alone; read it with --jobs 1")
 
 
 def _options(parameters: Parameters, given: Given) -> str:
@@ -336,5 +338,5 @@ def _options(parameters: Parameters, given: Given) -> str:
 
 def _fingerprint(recording: StoredRecording, options: str) -> str:
     """Return a text that changes with the recording, the program or the options."""
-    files = [(as_text(each.where), each.size, each.stamp) for each in recording.files]
+    files = [(as_text(file.where), file.size, file.stamp) for file in recording.files]
     return hashlib.sha256(json.dumps([options, files]).encode()).hexdigest()

@@ -76,7 +76,8 @@ class CompassDeviation(NamedTuple):
 class WaterOfRecording(NamedTuple):
     """Water properties of a recording.
 
-    first_ns: stamp of the recording's first sample. used: speed of sound used by the DVL, m/s, nan if unknown.
+    first_ns: stamp of the recording's first sample.
+    used: speed of sound used by the DVL, m/s, nan if unknown.
     cause_of_scale: explanation of the scale by the water, in a sentence.
     """
 
@@ -115,8 +116,8 @@ class NeedsPerson(NamedTuple):
 def histories(entries: Sequence[Catalogued]) -> list[VehicleHistory]:
     """Return the history of each vehicle, by name. entries: each recording once (`distinct`)."""
     by_vehicle: dict[str, list[Catalogued]] = defaultdict(list)
-    for each in entries:
-        by_vehicle[each.vehicle].append(each)
+    for entry in entries:
+        by_vehicle[entry.vehicle].append(entry)
     return [_history(name, entries_of) for name, entries_of in sorted(by_vehicle.items())]
 
 
@@ -124,10 +125,10 @@ def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[Need
     """Remove recordings with the same data as another, which would confirm itself; also return those."""
     first: dict[Any, Catalogued] = {}
     unique, doubled = [], []
-    for each in entries:
-        fit = each.extrinsics
+    for entry in entries:
+        fit = entry.extrinsics
         key = (
-            each.recording
+            entry.recording
             if fit is None
             else (fit.model, fit.first_ns, fit.last_ns, fit.used, fit.covariance.tobytes())
         )
@@ -136,42 +137,42 @@ def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[Need
                 NeedsPerson(
                     "SAME_DATA",
                     f"the same data as {first[key].recording}: only that is used",
-                    (each.recording,),
-                    each.vehicle,
+                    (entry.recording,),
+                    entry.vehicle,
                 )
             )
         else:
-            first[key] = each
-            unique.append(each)
+            first[key] = entry
+            unique.append(entry)
     return unique, doubled
 
 
 def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
     """Return recordings without a calibration or with a rejected one, by vehicle and reason, most frequent first."""
     groups: dict[tuple[str, str, str], list[Catalogued]] = defaultdict(list)
-    for each in entries:
-        row = each.rows[0]
-        if each.error:
-            groups[each.vehicle, "", each.error].append(each)
+    for entry in entries:
+        row = entry.rows[0]
+        if entry.error:
+            groups[entry.vehicle, "", entry.error].append(entry)
         elif row["verdict"] == "reject":
-            groups[each.vehicle, row["codes"][0] if row["codes"] else "", ""].append(each)
+            groups[entry.vehicle, row["codes"][0] if row["codes"] else "", ""].append(entry)
     found = [
-        NeedsPerson(code, error or members[0].rows[0]["reason"], tuple(each.recording for each in members), vehicle)
+        NeedsPerson(code, error or members[0].rows[0]["reason"], tuple(member.recording for member in members), vehicle)
         for (vehicle, code, error), members in groups.items()
     ]
-    return sorted(found, key=lambda each: -len(each.recordings))
+    return sorted(found, key=lambda group: -len(group.recordings))
 
 
 def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
     """Return the history of a vehicle: days, comparison, heading deviation and water."""
-    usable = [each for each in entries if each.is_usable]
+    usable = [entry for entry in entries if entry.is_usable]
     # models without GNSS assume no current, so they are not compared with models with GNSS
-    aided = [each for each in entries if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
-    days = _average_days([each for each in aided if each.is_usable] or usable)
+    aided = [entry for entry in entries if entry.extrinsics is not None and MODELS[entry.extrinsics.model].aided]
+    days = _average_days([entry for entry in aided if entry.is_usable] or usable)
     rejected = [
-        replace(each.extrinsics, name=each.recording.rpartition("/")[2])
-        for each in aided
-        if each.extrinsics is not None and not each.is_usable
+        replace(entry.extrinsics, name=entry.recording.rpartition("/")[2])
+        for entry in aided
+        if entry.extrinsics is not None and not entry.is_usable
     ]
     compared = _compare_if_several([*days, *rejected]) if days else None
     return VehicleHistory(name, len(entries), tuple(days), compared, _heading(usable), _water(usable))
@@ -188,44 +189,44 @@ def _compare_if_several(several: Sequence[Extrinsics]) -> Comparison | None:
 def _average_days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
     """Average the recordings of each day, separately before and after a movement of the mounting."""
     by_day: dict[int, list[tuple[Extrinsics, Array]]] = defaultdict(list)
-    for each in entries:
-        if each.extrinsics is not None and each.covariance_of_recording is not None:
-            by_day[each.extrinsics.first_ns // DAY_NS].append((each.extrinsics, each.covariance_of_recording))
-    found = []
-    for _, of_one_day in sorted(by_day.items()):
-        of_one_day.sort(key=lambda each: each[0].first_ns)
-        found += [_average_day(part) for part in _split_at_moves(of_one_day)]
-    return found
+    for entry in entries:
+        if entry.extrinsics is not None and entry.covariance_of_recording is not None:
+            by_day[entry.extrinsics.first_ns // DAY_NS].append((entry.extrinsics, entry.covariance_of_recording))
+    averages = []
+    for _, recordings in sorted(by_day.items()):
+        recordings.sort(key=lambda recording: recording[0].first_ns)
+        averages += [_average_day(part) for part in _split_at_moves(recordings)]
+    return averages
 
 
-def _split_at_moves(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
-    """Split the recordings of one day where the mounting moved."""
-    compared = _compare_if_several([each for each, _ in own])
+def _split_at_moves(recordings: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
+    """Split the recordings of one day where the mounting moved. Each is (calibration, covariance of it alone)."""
+    compared = _compare_if_several([calibration for calibration, _ in recordings])
     starts = [] if compared is None else [change.first_after.name for change in compared.moved]
     parts: list[list[tuple[Extrinsics, Array]]] = [[]]
-    for each in own:
-        if each[0].name in starts and parts[-1]:
+    for calibration, alone in recordings:
+        if calibration.name in starts and parts[-1]:
             parts.append([])
-        parts[-1].append(each)
+        parts[-1].append((calibration, alone))
     return parts
 
 
-def _average_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
+def _average_day(recordings: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
     """Average a day's recordings, adding the variation between days once."""
-    of_days = [each.covariance - alone for each, alone in own]
-    together = fused([replace(each, covariance=alone) for each, alone in own])
+    of_days = [recording.covariance - alone for recording, alone in recordings]
+    together = fused([replace(recording, covariance=alone) for recording, alone in recordings])
     covariance = together.covariance + max(of_days, key=np.trace)
-    name = own[0][0].name.rpartition("/")[2] if len(own) == 1 else f"{len(own)} recordings"
+    name = recordings[0][0].name.rpartition("/")[2] if len(recordings) == 1 else f"{len(recordings)} recordings"
     return replace(together, name=name, covariance=covariance)
 
 
 def _water(entries: Sequence[Catalogued]) -> WaterOfRecording | None:
     """Return the water properties of the newest recording that has them."""
     found = []
-    for each in entries:
-        if each.extrinsics is not None and each.cause_of_scale:
-            used = next((row["value"] for row in each.rows if row["parameter"] == "dvl_speed_of_sound"), math.nan)
-            found.append(WaterOfRecording(each.extrinsics.first_ns, used, each.cause_of_scale))
+    for entry in entries:
+        if entry.extrinsics is not None and entry.cause_of_scale:
+            used = next((row["value"] for row in entry.rows if row["parameter"] == "dvl_speed_of_sound"), math.nan)
+            found.append(WaterOfRecording(entry.extrinsics.first_ns, used, entry.cause_of_scale))
     return max(found, default=None)
 
 
@@ -233,8 +234,8 @@ def _heading(entries: Sequence[Catalogued]) -> CompassDeviation | None:
     """Return the weighted mean over all recordings; None if no heading was compared."""
     names = HEADING_ERRORS[:4]
     values, stds = [], []
-    for each in entries:
-        by_parameter = {row["parameter"]: row for row in each.rows}
+    for entry in entries:
+        by_parameter = {row["parameter"]: row for row in entry.rows}
         if all(name in by_parameter for name in names):
             values.append([by_parameter[name]["value"] for name in names])
             stds.append([by_parameter[name]["std_recording"] for name in names])

@@ -136,7 +136,7 @@ def _recorded_sound(
     if abs(now.get(SPEED_OF_SOUND, used) - used) > SAME_SPEED:
         raise InputError(
             f"{SPEED_OF_SOUND}={now[SPEED_OF_SOUND]:g}: the recording says that the DVL used {used:.1f} m/s; leave "
-            "this setting out, or calibrate with a recording of it"
+            "this setting out, or calibrate with a recording that used it"
         )
     return {SPEED_OF_SOUND: round(used, 2)}
 
@@ -147,7 +147,7 @@ def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> t
     angle = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
     sound, of_sound = _speed_of_sound(calibrated, now.get(SPEED_OF_SOUND))
     settings, notes = [angle, *sound], [*_residual_notes(calibrated, swing), *_delay(calibrated), *of_sound]
-    command = {"command": "set_config", "parameters": {each.name: each.new for each in settings}}
+    command = {"command": "set_config", "parameters": {setting.name: setting.new for setting in settings}}
     return settings, json.dumps(command) + "\n", notes
 
 
@@ -227,7 +227,7 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
         )
     if calibrated.model.scale_axes:
         notes.append(f"the DVL's scale, {100.0 * calibrated.scale_ahead:+.2f} %, is its own to set")
-    return settings, "".join(f"{each.name},{each.new:g}\n" for each in settings), notes
+    return settings, "".join(f"{setting.name},{setting.new:g}\n" for setting in settings), notes
 
 
 def _heading(calibrated: CalibratedMounting, now_deg: float) -> tuple[float, Array]:
@@ -260,7 +260,7 @@ def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
     axes = swing if _is_down(calibrated) else FLU_FROM_FRD @ swing @ FLU_FROM_FRD
     mounting = calibrated.parameters.rotation_dvl_from_body.T @ axes
     of_frame = mounting @ FLU_FROM_FRD if calibrated.turned else mounting
-    degrees = ", ".join(f"{math.degrees(each):.2f}°" for each in roll_pitch)
+    degrees = ", ".join(f"{math.degrees(angle):.2f}°" for angle in roll_pitch)
     return [
         *notes,
         f"roll and pitch ({degrees}) are no setting of the instrument: with it set, give the URDF rpy="
@@ -332,7 +332,7 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
         with socket.create_connection((parts["ipv6"] or parts["host"], port), timeout=PATIENCE_S) as connection:
             dvl = _Dvl(connection, address)
             before = dvl.ask({"command": "get_config"})
-            if all(_is_set_to(before, each.name, each.new) for each in settings):
+            if all(_is_set_to(before, setting.name, setting.new) for setting in settings):
                 return True
             for each in settings:
                 if each.now is None or not _is_set_to(before, each.name, each.now):
@@ -344,7 +344,7 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
             if dry_run:
                 return False
             is_sent = True
-            dvl.ask({"command": "set_config", "parameters": {each.name: each.new for each in settings}})
+            dvl.ask({"command": "set_config", "parameters": {setting.name: setting.new for setting in settings}})
             after = dvl.ask({"command": "get_config"})
     except UnicodeError as error:
         raise InputError(f"--send {address}: is no name that a host can have; give its name or address") from error
@@ -356,11 +356,11 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
                 "which first reads the current settings"
             ) from error
         raise InputError(f"{address}: {why}; is the DVL on, and the address right?") from error
-    for each in settings:
-        if not _is_set_to(after, each.name, each.new):
+    for setting in settings:
+        if not _is_set_to(after, setting.name, setting.new):
             raise InputError(
-                f"{address}: {each.name} was set to {each.new:g} and is {_number(after, each.name)}; look at the DVL's "
-                "own page"
+                f"{address}: {setting.name} was set to {setting.new:g} and is {_number(after, setting.name)}; "
+                "look at the DVL's own page"
             )
     return False
 

@@ -152,26 +152,26 @@ class _VehicleMessages:
         self.fixes.append((stamp_ns, [north, east, down]))
 
     def att(self, stamp_ns: int, m: Any) -> None:
-        self.turned.append((stamp_ns, [math.radians(each) for each in (m.Roll, m.Pitch, m.Yaw)]))
+        self.turned.append((stamp_ns, [math.radians(angle) for angle in (m.Roll, m.Pitch, m.Yaw)]))
 
     def attitude(self, stamp_ns: int, m: Any) -> None:
         self.turned.append((stamp_ns, [m.roll, m.pitch, m.yaw]))
 
     def finished(self) -> DvlLog:
         """Return the samples in order of time."""
-        samples = [DvlSample(at, _tuple(FLU_FROM_FRD @ np.array(each)), None) for at, each in self.moved]
-        references = [ReferenceSample(at, _tuple(each), None, VelocityFrame.NED) for at, each in _in_order(self.fixes)]
+        samples = [DvlSample(at, _tuple(FLU_FROM_FRD @ np.array(frd)), None) for at, frd in self.moved]
+        references = [ReferenceSample(at, _tuple(ned), None, VelocityFrame.NED) for at, ned in _in_order(self.fixes)]
         turned = _in_order(self.turned)
-        attitudes = imu_samples([at for at, _ in turned], np.array([each for _, each in turned]).reshape(-1, 3))
+        attitudes = imu_samples([at for at, _ in turned], np.array([row for _, row in turned]).reshape(-1, 3))
         return DvlLog(samples, self.left_out, references, attitudes)
 
 
 def _in_order(rows: list[tuple[int, list[float]]]) -> list[tuple[int, list[float]]]:
-    return sorted({at: (at, each) for at, each in rows if np.isfinite(each).all()}.values())
+    return sorted({at: (at, row) for at, row in rows if np.isfinite(row).all()}.values())
 
 
 def _tuple(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(each) + 0.0 for each in values)
+    x, y, z = (float(value) + 0.0 for value in values)
     return x, y, z
 
 

@@ -52,8 +52,10 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
 class DvlLog(NamedTuple):
     """DVL samples (forward-left-up) in order of time, and the number of unusable reports by reason.
 
-    references, attitudes, waters: other samples in the log. notes: remarks in sentences. nominal_yaw: rad, of the DVL
-    in the body of the attitudes (forward-left-up), as configured in the instrument; 0 if it has its own compass.
+    references, attitudes, waters: other samples in the log.
+    notes: remarks in sentences.
+    nominal_yaw: rad, of the DVL in the body of the attitudes (forward-left-up), as configured in the instrument; 0 if
+      it has its own compass.
     """
 
     samples: list[DvlSample]

@@ -80,7 +80,7 @@ def read_dvl_log(path: Path) -> DvlLog:
     if not log.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"
         raise InputError(f"{path}: no velocity that can be used ({why})")
-    in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda each: each.stamp_ns)
+    in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda one: one.stamp_ns)
     log.left_out["of a time that was there already"] += len(log.samples) - len(in_order)
     return log._replace(samples=in_order, left_out=+log.left_out)
 
@@ -155,13 +155,13 @@ def _ensembles(content: bytes) -> Iterator[list[tuple[int, bytes]]]:
     """Yield ID and data of all parts of each whole ensemble."""
     start = 0
     while (found := _next_ensemble(content, start)) is not None:
-        at, start = found
-        body = content[at : start - 2]
+        begin, start = found
+        body = content[begin : start - 2]
         n_types = body[5]
         if 6 + 2 * n_types > len(body):
             continue
         offsets = struct.unpack_from(f"<{n_types}H", body, 6)
-        yield [(struct.unpack_from("<H", body, each)[0], body[each:]) for each in offsets if each + 2 <= len(body)]
+        yield [(struct.unpack_from("<H", body, part)[0], body[part:]) for part in offsets if part + 2 <= len(body)]
 
 
 def _read_pd0(path: Path, content: bytes) -> DvlLog:
@@ -172,11 +172,11 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
     nmea = Nmea()
     waters: list[WaterReading] = []
     alignments: Counter[float] = Counter()
-    for each in _ensembles(content):
-        data = dict(each)
+    for ensemble in _ensembles(content):
+        data = dict(ensemble)
         try:
             stamp_ns = _pd0_stamp(data)
-            for identity, message in each:
+            for identity, message in ensemble:
                 if identity == GENERAL_NMEA:
                     nmea.take(stamp_ns, message)
             sample = _pd0_sample(path, stamp_ns, data, left_out)
@@ -209,12 +209,12 @@ def _pd0_attitudes(
     path: Path, attitudes: dict[int, tuple[float, float, float]], nmea: Nmea
 ) -> tuple[list[int], Array, tuple[str, ...]]:
     """Return stamps, roll, pitch, heading (N, 3) rad, and notes on their source."""
-    own = sorted(attitudes)
-    rpy = np.array([attitudes[at] for at in own]).reshape(-1, 3)
+    dvl_stamps = sorted(attitudes)
+    rpy = np.array([attitudes[stamp] for stamp in dvl_stamps]).reshape(-1, 3)
     stamps, headings = nmea.headings()
-    if stamps and own:
-        at = np.array(stamps, dtype=np.int64) - own[0]
-        tilts = [np.interp(at, np.array(own, dtype=np.int64) - own[0], rpy[:, place]) for place in (0, 1)]
+    if stamps and dvl_stamps:
+        since_first, dvl_since_first = (np.array(ns, dtype=np.int64) - dvl_stamps[0] for ns in (stamps, dvl_stamps))
+        tilts = [np.interp(since_first, dvl_since_first, rpy[:, axis]) for axis in (0, 1)]
         note = f"{path}: the heading is from its HDT sentences, pitch and roll are the DVL's own"
         return stamps, np.column_stack([*tilts, headings]), (note,)
     if not len(rpy) or not np.ptp(rpy, axis=0).any():  # no sensor: a constant setting
@@ -223,7 +223,7 @@ def _pd0_attitudes(
         f"{path}: heading, pitch and roll are from the DVL's own sensors; the heading is magnetic unless the "
         "setting EB is the declination; give --attitude for another source"
     )
-    return own, rpy, (note,)
+    return dvl_stamps, rpy, (note,)
 
 
 def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float] | None:

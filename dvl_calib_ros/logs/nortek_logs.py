@@ -96,13 +96,13 @@ def _sample(data: bytes) -> DvlSample | None:
     if not (valid[0] and valid[1] and valid[2:].any()):
         return None
     # as in C's struct tm: years since 1900, months from 0
-    at = datetime(1900 + year, month + 1, day, hour, minute, second, tzinfo=timezone.utc)
+    whole_second = datetime(1900 + year, month + 1, day, hour, minute, second, tzinfo=timezone.utc)
     dt = float(delay[:2].mean())
-    stamp_ns = int(at.timestamp()) * 1_000_000_000 + fraction * 100_000
+    stamp_ns = int(whole_second.timestamp()) * 1_000_000_000 + fraction * 100_000
     stamp_ns += round(1e9 * dt) if 0.0 <= dt < _LONGEST_DT_S else 0
     weights = valid[2:] / valid[2:].sum()
     vertical = float(np.where(valid[2:], velocity[2:], 0.0) @ weights)
     stds = [*noise[:2].tolist(), float(np.where(valid[2:], noise[2:], 0.0) @ weights)]
-    covariance = np.diag(np.square(stds)) if all(math.isfinite(each) and each > 0.0 for each in stds) else None
+    covariance = np.diag(np.square(stds)) if all(math.isfinite(std) and std > 0.0 for std in stds) else None
     x, y, z = (FLU_FROM_FRD @ [velocity[0], velocity[1], vertical] + 0.0).tolist()
     return DvlSample(stamp_ns, (x, y, z), covariance)

@@ -48,32 +48,33 @@ def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
     notes: receives remarks on skipped data. Raises InputError if there is no usable sentence.
     """
     covariance = np.eye(3) * std**2 if std else None
-    found: dict[int, ReferenceSample] = {}
-    damaged = without = 0
+    samples: dict[int, ReferenceSample] = {}  # by stamp
+    n_damaged = n_incomplete = 0
     for text, checksum in _RMC.findall(path.read_bytes()):
         if checksum_of(text) != int(checksum, 16):
-            damaged += 1
+            n_damaged += 1
             continue
         try:
             fields = text.decode("ascii").split(",")
             speed = float(fields[7]) * KNOT
             course = math.radians(float(fields[8])) if fields[8] or speed > STANDING else 0.0
-            at = datetime.strptime(fields[9] + fields[1].partition(".")[0], "%d%m%y%H%M%S").replace(tzinfo=timezone.utc)
-            fraction = float("0." + (fields[1].partition(".")[2] or "0"))
+            time, _, decimals = fields[1].partition(".")
+            second = datetime.strptime(fields[9] + time, "%d%m%y%H%M%S").replace(tzinfo=timezone.utc)
+            fraction = float("0." + (decimals or "0"))
             if fields[2] != "A" or not 0.0 <= speed < 100.0:
                 raise ValueError
         except (ValueError, IndexError):
-            without += 1
+            n_incomplete += 1
             continue
-        stamp_ns = int(at.timestamp()) * 1_000_000_000 + round(fraction * 1e9)
+        stamp_ns = int(second.timestamp()) * 1_000_000_000 + round(fraction * 1e9)
         east, north, up = over_ground(speed, course).tolist()
-        found[stamp_ns] = ReferenceSample(stamp_ns, (east, north, up), covariance, VelocityFrame.ENU)
-    if not found:
+        samples[stamp_ns] = ReferenceSample(stamp_ns, (east, north, up), covariance, VelocityFrame.ENU)
+    if not samples:
         raise InputError(f"{path}: no RMC sentence with a fix, time, date, speed and course in it")
-    for count, why in ((damaged, "have a wrong checksum"), (without, "have no fix, time, speed or course")):
+    for count, why in ((n_damaged, "have a wrong checksum"), (n_incomplete, "have no fix, time, speed or course")):
         if count:
             notes.append(f"{path}: {count} RMC sentences {why}, left out")
-    return [found[at] for at in sorted(found)]
+    return [samples[stamp_ns] for stamp_ns in sorted(samples)]
 
 
 def checksum_of(text: bytes) -> int:
@@ -137,15 +138,17 @@ class Nmea:
         return stamps, values[:, 0]
 
     def _in_order(self, kind: str) -> tuple[list[int], Array]:
-        """Return stamps (ns) and values of one kind of sentence, with the sign of DT that spaces them most evenly."""
-        own = self._found[kind]
-        if not own:
+        """Return stamps (ns) and values of one kind of sentence, in order.
+
+        The sign of the time difference to the ensemble is the one that spaces the stamps most evenly.
+        """
+        if not self._found[kind]:
             return [], np.zeros((0, 2))
-        at = np.array([stamp_ns for stamp_ns, _, _ in own])
-        delta_ns = np.array([round(1e9 * delta) for _, delta, _ in own])
-        stamps = min((at - delta_ns, at + delta_ns), key=_unevenness)
+        ensemble_ns, differences_s, values = zip(*self._found[kind], strict=True)
+        difference_ns = np.array([round(1e9 * seconds) for seconds in differences_s])
+        stamps = min((np.array(ensemble_ns) - difference_ns, np.array(ensemble_ns) + difference_ns), key=_unevenness)
         stamps, index = np.unique(stamps, return_index=True)
-        return stamps.tolist(), np.array([own[i][2] for i in index])
+        return stamps.tolist(), np.array([values[i] for i in index])
 
 
 def _unevenness(stamps: np.ndarray) -> float:
@@ -174,8 +177,8 @@ def _parse_text_sentence(kind: str, sentence: re.Match[bytes]) -> list[float]:
     """Parse the values of a sentence in text, see `_values`. Raises ValueError for another kind or a wrong checksum."""
     name, text, checksum = sentence.groups()
     fields = text.decode("ascii").split(",")
-    whole = sentence[0][1:].partition(b"*")[0]
-    if name.decode() != kind or (checksum is not None and checksum_of(whole) != int(checksum, 16)):
+    checked = sentence[0][1:].partition(b"*")[0]
+    if name.decode() != kind or (checksum is not None and checksum_of(checked) != int(checksum, 16)):
         raise ValueError
     if kind == _HDT:
         return [math.radians(float(fields[0]))]
@@ -207,9 +210,7 @@ def _position(latitude: float, south: bytes, longitude: float, west: bytes, qual
 def _differences(stamps: Sequence[int], positions: Array) -> tuple[list[int], Array]:
     """Return stamps and velocities (M, 3) from differences of positions (N, 2)."""
     difference = FixDifference()
-    each = (
-        difference(at, latitude, longitude, 0.0, None)
-        for at, (latitude, longitude) in zip(stamps, positions.tolist(), strict=True)
-    )
-    found = [one for one in each if one is not None]
-    return [one.stamp_ns for one in found], np.array([one.velocity for one in found]).reshape(-1, 3)
+    fixes = zip(stamps, positions.tolist(), strict=True)
+    tried = (difference(stamp_ns, latitude, longitude, 0.0, None) for stamp_ns, (latitude, longitude) in fixes)
+    means = [mean for mean in tried if mean is not None]
+    return [mean.stamp_ns for mean in means], np.array([mean.velocity for mean in means]).reshape(-1, 3)

@@ -49,8 +49,8 @@ def read_pd6(path: Path, content: bytes) -> DvlLog:
         fields = text.decode("ascii", "replace").split(",")
         try:
             if kind == b"TS":
-                at = datetime.strptime(fields[0][:12], "%y%m%d%H%M%S").replace(tzinfo=timezone.utc)
-                stamp_ns = int(at.timestamp()) * _SECOND_NS + int(fields[0][12:14]) * 10_000_000
+                second = datetime.strptime(fields[0][:12], "%y%m%d%H%M%S").replace(tzinfo=timezone.utc)
+                stamp_ns = int(second.timestamp()) * _SECOND_NS + int(fields[0][12:14]) * 10_000_000
                 if tilt is not None:  # the tilt precedes its time
                     attitudes[stamp_ns] = tilt
             elif kind == b"SA":
@@ -62,10 +62,10 @@ def read_pd6(path: Path, content: bytes) -> DvlLog:
         except (ValueError, IndexError):
             left_out["damaged"] += 1
     stamps = sorted(attitudes)
-    rpy = np.array([attitudes[at] for at in stamps]).reshape(-1, 3)
+    rpy = np.array([attitudes[stamp] for stamp in stamps]).reshape(-1, 3)
     note = f"{path}: heading, pitch and roll are from the DVL's own sensors; give --attitude for another source"
-    own = imu_samples(stamps, rpy) if len(rpy) and np.ptp(rpy, axis=0).any() else []
-    return DvlLog(samples, left_out, (), own, (note,) if own else (), nominal_yaw=0.0 if own else None)
+    attitude = imu_samples(stamps, rpy) if len(rpy) and np.ptp(rpy, axis=0).any() else []
+    return DvlLog(samples, left_out, (), attitude, (note,) if attitude else (), nominal_yaw=0.0 if attitude else None)
 
 
 def read_sentences(_: Path, content: bytes) -> DvlLog:
@@ -81,9 +81,9 @@ def read_sentences(_: Path, content: bytes) -> DvlLog:
         try:
             if name == _BEAM_TIME:
                 named = dict(field.split("=") for field in fields)
-                whole, _, fraction = named["TIME"].partition(".")
-                at = datetime.strptime(named["DATE"] + whole, "%m%d%y%H%M%S").replace(tzinfo=timezone.utc)
-                beam_ns = int(at.timestamp()) * _SECOND_NS + round(float(f"0.{fraction or 0}") * 1e9)
+                time, _, decimals = named["TIME"].partition(".")
+                second = datetime.strptime(named["DATE"] + time, "%m%d%y%H%M%S").replace(tzinfo=timezone.utc)
+                beam_ns = int(second.timestamp()) * _SECOND_NS + round(float(f"0.{decimals or 0}") * 1e9)
             elif name == _VELOCITY:
                 x, y, _fom, z1, z2 = map(float, fields[2:7])
                 _add(samples, left_out, beam_ns, (x, -y, -0.5 * (z1 + z2)))

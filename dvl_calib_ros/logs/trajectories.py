@@ -157,8 +157,8 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
             f"time=NAME,vx=NAME,vy=NAME,vz=NAME; there are {names}"
         )
     units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
-    for cell, found, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
-        if found and found.group(1).strip().lower() != expected:
+    for cell, stated, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
+        if stated and stated.group(1).strip().lower() != expected:
             raise InputError(f"{path}: column {cell[:SHOWN]!r} is not in {expected}; convert it first")
     if "time" not in header[0].lower() and header[0].strip().lower() not in ("t", "s", "stamp", "t_s"):
         raise InputError(f"{path}: the first column is {header[0][:SHOWN]!r}, expected time")
@@ -230,6 +230,7 @@ class ImportOptions:
     compression: Compression = Compression.NONE
 
     def __post_init__(self) -> None:
+        """Check columns, start, frames and standard deviations. Raises InputError."""
         for name, std in (("--dvl-std", self.dvl_std), ("--gnss-std", self.gnss_std)):
             if not 0.0 <= std <= 100.0:
                 raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")
@@ -370,7 +371,10 @@ def column_map(text: str) -> Mapping[str, str]:
 def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float) -> DvlLog:
     """Read the velocities of a table. Raises InputError naming file and column.
 
-    text: the map. start_ns: stamp of time 0. rotation: (3, 3) to forward-left-up. std: m/s; 0: covariance not given.
+    text: the map.
+    start_ns: stamp of time 0.
+    rotation: (3, 3) to forward-left-up.
+    std: m/s; 0: covariance not given.
     """
     names = column_map(text)
     if not path.is_file():  # a pipe would block
@@ -381,20 +385,20 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
         raise InputError(f"{path}: cannot be read as text ({error}); save it in UTF-8") from error
     first = next((line for line in lines if line.strip()), "")
     rows = [row for row in csv.reader(lines, delimiter=max(_SEPARATORS, key=first.count)) if row]
-    at = {key: [_column_index(path, rows[:1], name) for name in names[key].split("+")] for key in names}
+    indices = {key: [_column_index(path, rows[:1], name) for name in names[key].split("+")] for key in names}
     covariance = np.eye(3) * std**2 if std else None
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
-    for row in rows[_is_header(rows[:1], at["vx"][0]) :]:
+    for row in rows[_is_header(rows[:1], indices["vx"][0]) :]:
         try:
-            stamp_ns = _stamp_ns(" ".join(row[place].strip() for place in at["time"]), start_ns)
-            velocity = rotation @ [float(row[at[key][0]]) for key in _NEEDED[1:]]
+            stamp_ns = _stamp_ns(" ".join(row[index].strip() for index in indices["time"]), start_ns)
+            velocity = rotation @ [float(row[indices[key][0]]) for key in _NEEDED[1:]]
         except (ValueError, IndexError, OverflowError):
             left_out["without a time or a velocity"] += 1
             continue
         if not np.isfinite(velocity).all() or not 0 < stamp_ns < 2**31 * 1_000_000_000:
             left_out["without a time or a velocity"] += 1
-        elif "valid" in at and row[at["valid"][0]].strip().lower() in _FALSE:
+        elif "valid" in indices and row[indices["valid"][0]].strip().lower() in _FALSE:
             left_out["not valid"] += 1
         else:
             x, y, z = velocity.tolist()
@@ -402,7 +406,8 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
     if not samples:
         excerpt = repr(",".join(rows[-1])[:SHOWN]) if rows else "it is empty"
         raise InputError(f"{path}: no row with time and velocity in the columns of --columns; the last is {excerpt}")
-    return DvlLog(sorted({each.stamp_ns: each for each in samples}.values(), key=lambda each: each.stamp_ns), left_out)
+    by_stamp = {sample.stamp_ns: sample for sample in samples}
+    return DvlLog([by_stamp[stamp_ns] for stamp_ns in sorted(by_stamp)], left_out)
 
 
 def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
@@ -417,9 +422,9 @@ def _column_index(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
     """Return the index of a column by its name, its name without the unit, or its number. Raises InputError."""
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     key = name.strip().lower()
-    for each in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
-        if key in each:
-            return each.index(key)
+    for names in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
+        if key in names:
+            return names.index(key)
     if key.isdecimal() and 0 < int(key) <= len(header):
         return int(key) - 1
     raise InputError(f"{path}: --columns: no column {name!r}; there are {', '.join(header)[:SHOWN] or 'none'}")

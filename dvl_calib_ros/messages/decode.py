@@ -85,8 +85,8 @@ class DeclaredFrame(NamedTuple):
 
 # by value of parameter gnss_frame
 DECLARED_FRAMES = {
-    each.name: each
-    for each in (
+    declared.name: declared
+    for declared in (
         *map(DeclaredFrame, VelocityFrame),
         *(DeclaredFrame(VelocityFrame.BODY, HALF_TURN, axes) for axes in (FLU, FRD)),
         DeclaredFrame(VelocityFrame.ENU, QUARTER_TURN),
@@ -200,6 +200,7 @@ class MessageDecoder:
     """
 
     def __init__(self, parameters: Parameters, on_problem: Callable[[str], None] = lambda _: None) -> None:
+        """Select the conversion of each type. on_problem: receives the text of each new problem."""
         self.parameters = parameters
         self.dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         self.reference_type = velocity_type("gnss_type", parameters.gnss_type)
@@ -263,14 +264,14 @@ class MessageDecoder:
         """Return the velocity between a position and the one a window earlier; the position itself goes to `on_fix`."""
         if not kind.is_valid(message):
             return Refusal(NO_FIX)
-        place, given = kind.place(message), kind.covariance(message)
+        place, covariance = kind.place(message), kind.covariance(message)
         if frame is not VelocityFrame.BODY and math.isfinite(sum(place)):
             self._origin = self._origin or place
-            self.on_fix(stamp_ns, *_east_north_up(kind, self._origin, place, given, frame))
-        found = self._fixes(stamp_ns, *place, given)
-        if found is None:
+            self.on_fix(stamp_ns, *_east_north_up(kind, self._origin, place, covariance, frame))
+        mean = self._fixes(stamp_ns, *place, covariance)
+        if mean is None:
             return Refusal(FIRST_FIX)
-        return ReferenceSample(found.stamp_ns, found.velocity, found.covariance, frame)
+        return ReferenceSample(mean.stamp_ns, mean.velocity, mean.covariance, frame)
 
     def imu(self, message: Any, received_ns: int) -> ImuSample | Refusal:
         """Decode a sensor_msgs/Imu. A covariance that starts with -1 means that the quantity is missing.
@@ -375,12 +376,12 @@ class MessageDecoder:
         if self.imu_alignment.is_identity and frame_id.lstrip("/") != base.lstrip("/"):
             self._report("imu frame", finding("IMU_FRAME", frame_id=frame_id, base=base))
 
-    def _report(self, kind: str, found: Reason) -> None:
+    def _report(self, kind: str, reason: Reason) -> None:
         """Remember a problem, and report it if it is the first of its kind."""
         is_new = kind not in self.problems
-        self.problems[kind] = found
+        self.problems[kind] = reason
         if is_new:  # alternating frames or ever new garbage must not be reported with every message
-            self._on_problem(str(found))
+            self._on_problem(str(reason))
 
 
 def _east_north_up(

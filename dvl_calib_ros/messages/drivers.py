@@ -65,8 +65,10 @@ _LARGEST = sys.float_info.max
 class Rule(NamedTuple):
     """A condition under which a message's velocity is invalid, even if plausible.
 
-    counter: name of the counter of such messages. says: the fault. broken: the test, for a message or for columns of
-    many, so it uses operators valid for both. remedy: what to do.
+    counter: name of the counter of such messages.
+    says: the fault.
+    broken: the test, for a message or for columns of many, so it uses operators valid for both.
+    remedy: what to do.
     """
 
     counter: str
@@ -84,15 +86,20 @@ class Rule(NamedTuple):
 class VelocityType:
     """One message type.
 
-    velocity: message -> object with x, y, z, m/s. covariance: message -> covariance of that velocity, row-major, 9
-    numbers or 36 of a twist, (m/s)²; None if not given. lacks_covariance: message -> whether the field is a
-    placeholder. frame_id: message -> frame of the velocity. is_read_in_columns: whether these functions also work on
-    columns of messages, which needs a type without lists. points_down: forward-right-down unless the frame's name says
-    otherwise. rules: of a DVL; the first broken one counts. is_reference, is_dvl: whether references and DVLs use this
-    type. position: how to read positions (positions.py), None for a type of velocities. reference_frame: axes of a
-    reference in this type regardless of frame_id; None to use frame_id. adapted: conversion of a message without
-    header; None if not needed. definitions: versions of the definition, for bags without. install: how to get the
-    package, if ROS does not have it.
+    velocity: message -> object with x, y, z, m/s.
+    covariance: message -> covariance of that velocity, row-major, 9 numbers or 36 of a twist, (m/s)²; None if not
+      given.
+    lacks_covariance: message -> whether the field is a placeholder.
+    frame_id: message -> frame of the velocity.
+    is_read_in_columns: whether these functions also work on columns of messages, which needs a type without lists.
+    points_down: forward-right-down unless the frame's name says otherwise.
+    rules: of a DVL; the first broken one counts.
+    is_reference, is_dvl: whether references and DVLs use this type.
+    position: how to read positions (positions.py), None for a type of velocities.
+    reference_frame: axes of a reference in this type regardless of frame_id; None to use frame_id.
+    adapted: conversion of a message without header; None if not needed.
+    definitions: versions of the definition, for bags without.
+    install: how to get the package, if ROS does not have it.
     """
 
     name: str
@@ -167,10 +174,7 @@ def _has_no_range(message: Any) -> Any:
 
 # without bottom lock the sensor sends altitude -1; 0 means that the driver does not fill it
 _NO_BOTTOM = Rule(
-    "no_bottom",
-    "`altitude` is negative or not finite",
-    lambda message, _: _has_no_altitude(message),
-    CHECK_LOCK,
+    "no_bottom", "`altitude` is negative or not finite", lambda message, _: _has_no_altitude(message), CHECK_LOCK
 )
 _NO_BOTTOM_NOR_RANGES = Rule(
     "no_bottom",
@@ -292,8 +296,8 @@ _FEW_BEAMS = Rule(
 
 # extended by recognised types (field_map.py)
 VELOCITY_TYPES: dict[str, VelocityType] = {
-    each.name: each
-    for each in (
+    kind.name: kind
+    for kind in (
         VelocityType(
             name=TWIST_TYPE,
             sent_by="any driver, the default",
@@ -461,10 +465,10 @@ VELOCITY_TYPES: dict[str, VelocityType] = {
 _WRITTEN = tuple(VELOCITY_TYPES.values())
 # for bags without message definitions
 KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
-    name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions
+    name: kind.definitions for name, kind in VELOCITY_TYPES.items() if kind.definitions
 }
-DVL_TYPES = {name: each for name, each in VELOCITY_TYPES.items() if each.is_dvl}
-REFERENCE_TYPES = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
+DVL_TYPES = {name: kind for name, kind in VELOCITY_TYPES.items() if kind.is_dvl}
+REFERENCE_TYPES = {name: kind for name, kind in VELOCITY_TYPES.items() if kind.is_reference}
 # allowed values of these parameters
 TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": DVL_TYPES, "gnss_type": REFERENCE_TYPES}
 
@@ -509,14 +513,15 @@ def velocity_type(parameter: str, name: str) -> VelocityType:
 def driver_table() -> str:
     """Return the documentation's table of message types, in Markdown."""
     lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
-    for each in _WRITTEN:
-        axes = ", forward-right-down" if each.points_down else ", forward-left-up" if each.is_dvl else ""
+    for written in _WRITTEN:
+        axes = ", forward-right-down" if written.points_down else ", forward-left-up" if written.is_dvl else ""
         # most types have zero_velocity, which the page explains once
         rules = "; ".join(
-            f"`{rule.counter}`" + (f": {rule.says}" if rule.counter != "zero_velocity" else "") for rule in each.rules
+            f"`{rule.counter}`" + (f": {rule.says}" if rule.counter != "zero_velocity" else "")
+            for rule in written.rules
         )
         lines.append(
-            f"| {each.name.replace('/msg/', '/')} | {each.sent_by} | {each.frame_says}{axes} | "
-            f"{each.covariance_says} | {rules} |"
+            f"| {written.name.replace('/msg/', '/')} | {written.sent_by} | {written.frame_says}{axes} | "
+            f"{written.covariance_says} | {rules} |"
         )
     return "\n".join(lines) + "\n"

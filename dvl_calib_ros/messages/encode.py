@@ -31,7 +31,9 @@ class SatelliteFix(NamedTuple):
 class WaterReading(NamedTuple):
     """A DVL's water properties.
 
-    speed_of_sound: m/s, as used by the DVL. temperature: °C. salinity: PSU. nan if not measured.
+    speed_of_sound: m/s, as used by the DVL.
+    temperature: °C.
+    salinity: PSU. nan if not measured.
     """
 
     stamp_ns: int
@@ -115,16 +117,16 @@ class SampleWriter:
     def water(self, readings: Iterable[WaterReading]) -> int:
         """Write a DVL's water readings, at most one per second. Return their number."""
         types, last_ns, written = self._types, 0, 0
-        for each in readings:
-            if written and abs(each.stamp_ns - last_ns) < _WATER_EVERY_NS:
+        for reading in readings:
+            if written and abs(reading.stamp_ns - last_ns) < _WATER_EVERY_NS:
                 continue
-            last_ns, written = each.stamp_ns, written + 1
-            if not math.isnan(each.temperature):
-                message = types[TEMPERATURE_TYPE](self._header(each.stamp_ns, "dvl_link"), each.temperature, 0.0)
-                self._bag.message("dvl/temperature", TEMPERATURE_TYPE, each.stamp_ns, message)
-            for name, value in (("sound_speed", each.speed_of_sound), ("salinity", each.salinity)):
+            last_ns, written = reading.stamp_ns, written + 1
+            if not math.isnan(reading.temperature):
+                message = types[TEMPERATURE_TYPE](self._header(reading.stamp_ns, "dvl_link"), reading.temperature, 0.0)
+                self._bag.message("dvl/temperature", TEMPERATURE_TYPE, reading.stamp_ns, message)
+            for name, value in (("sound_speed", reading.speed_of_sound), ("salinity", reading.salinity)):
                 if not math.isnan(value):
-                    self._bag.message(f"dvl/{name}", NUMBER_TYPE, each.stamp_ns, types[NUMBER_TYPE](value))
+                    self._bag.message(f"dvl/{name}", NUMBER_TYPE, reading.stamp_ns, types[NUMBER_TYPE](value))
         return written
 
     def _twist(self, sample: DvlSample | ReferenceSample, frame_id: str) -> Any:

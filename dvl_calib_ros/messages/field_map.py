@@ -176,10 +176,10 @@ class _Fields(NamedTuple):
 
     def walk(self, description: Description, prefix: str = "") -> Iterator[tuple[str, Description]]:
         """Yield all paths below a message except the header's, with their descriptions."""
-        for name, each in self.of(description).items():
+        for name, kind in self.of(description).items():
             if prefix or name != "header":
-                yield prefix + name, each
-                yield from self.walk(each, f"{prefix}{name}.")
+                yield prefix + name, kind
+                yield from self.walk(kind, f"{prefix}{name}.")
 
     def is_number(self, description: Description) -> bool:
         kind, detail = description
@@ -222,25 +222,25 @@ def misfit(text: str, store: Typestore, msgtype: str) -> str:
     return ""
 
 
-def _fits(fields: _Fields, key: str, found: Description, count: int) -> tuple[bool, str]:
+def _fits(fields: _Fields, key: str, description: Description, count: int) -> tuple[bool, str]:
     """Return whether a field's kind is allowed for a key, and the name of the allowed kind."""
     if key == "frame":
-        return found == (BASE, ("string", 0)), "text"
+        return description == (BASE, ("string", 0)), "text"
     if key == "stamp":
-        return fields.is_number(found) or "nanosec" in fields.of(found), "a time, or seconds"
+        return fields.is_number(description) or "nanosec" in fields.of(description), "a time, or seconds"
     if key == "variance" and count == 1:
-        return fields.is_number(found) or _is_three(fields, found), "a number, a vector or an array"
+        return fields.is_number(description) or _is_three(fields, description), "a number, a vector or an array"
     if key == "velocity" and count == 1:
-        return _is_three(fields, found), "a vector"
-    return fields.is_number(found), "a number"
+        return _is_three(fields, description), "a vector"
+    return fields.is_number(description), "a number"
 
 
-def _is_three(fields: _Fields, found: Description) -> bool:
-    return fields.is_vector(found) or fields.is_array(found)
+def _is_three(fields: _Fields, description: Description) -> bool:
+    return fields.is_vector(description) or fields.is_array(description)
 
 
 def _listed(fields: _Fields, description: Description) -> str:
-    names = [path for path, each in fields.walk(description) if not fields.of(each)]
+    names = [path for path, kind in fields.walk(description) if not fields.of(kind)]
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return (", ".join(names[:_NAMED]) or "none but its header") + more
 
@@ -260,16 +260,16 @@ def suggested(store: Typestore, msgtype: str) -> str:
 
 def _velocities(fields: _Fields, below: Mapping[str, Description]) -> Iterator[str]:
     """Yield maps of possible velocities, the most likely first."""
-    named = {path: each for path, each in below.items() if re.search(r"vel|linear|(^|_|\.)v[xyz]$", path, re.I)}
-    yield from (f"velocity={path}" for path, each in named.items() if _is_three(fields, each))
-    for path, each in named.items():
+    named = {path: kind for path, kind in below.items() if re.search(r"vel|linear|(^|_|\.)v[xyz]$", path, re.I)}
+    yield from (f"velocity={path}" for path, kind in named.items() if _is_three(fields, kind))
+    for path, kind in named.items():
         y, z = (re.sub(r"(?<![a-uw-z])x(?![a-z])", axis, path) for axis in "yz")
-        if y != path and fields.is_number(each) and each[1][0] != "bool" and y in below and z in below:
+        if y != path and fields.is_number(kind) and kind[1][0] != "bool" and y in below and z in below:
             yield f"velocity={path},{y},{z}"
-    for path, each in below.items():
-        own = dict(fields.walk(element)) if (element := fields.element(each)) is not None else {}
-        vectors = [name for name, of in own.items() if fields.is_vector(of)]
-        speeds = [name for name, of in own.items() if "vel" in name and fields.is_number(of)]
+    for path, kind in below.items():
+        inner = dict(fields.walk(element)) if (element := fields.element(kind)) is not None else {}
+        vectors = [name for name, inner_kind in inner.items() if fields.is_vector(inner_kind)]
+        speeds = [name for name, inner_kind in inner.items() if "vel" in name and fields.is_number(inner_kind)]
         if vectors and speeds:
             yield f"beams={path},{vectors[0]},{speeds[0]}"
 

@@ -34,8 +34,9 @@ AnySample = TypeVar("AnySample", DvlSample, ReferenceSample, ImuSample)
 class MessageFeed:
     """Feeds a calibrator with decoded samples and refusals, which it counts.
 
-    decoder: the message decoder. on_problem: receives the text of its new problems. kept: messages for `begin_again`.
-    Raises InputError for unknown message types.
+    decoder: the message decoder.
+    on_problem: receives the text of its new problems.
+    kept: messages for `begin_again`. Raises InputError for unknown message types.
     """
 
     def __init__(self, calibrator: Calibrator, on_problem: Callable[[str], None] = lambda _: None) -> None:
@@ -169,12 +170,13 @@ class KeptMessages(RowTable):
 
     def _block(self, stream: Stream) -> SampleBlock:
         """Return all kept samples of one stream."""
-        (at,) = np.nonzero(self.stream[: self.size] == _CODES[stream])
-        given = self.has_covariance[at]
-        each = Covariances.of(self.covariance[at[given]], int(given.sum()))
-        index = np.full(len(at), -1, dtype=np.intp)
-        index[given] = each.index
+        (rows,) = np.nonzero(self.stream[: self.size] == _CODES[stream])
+        has_covariance = self.has_covariance[rows]
+        given = Covariances.of(self.covariance[rows[has_covariance]], int(has_covariance.sum()))
+        index = np.full(len(rows), -1, dtype=np.intp)
+        index[has_covariance] = given.index
         return sample_block(
-            stream, self.stamps_ns[at], self.values[at, : WIDTH[stream]], covariance=Covariances(each.distinct, index),
-            frames=self.frames[at], arrival=at, refused=self.refused[at], reasons=self._reasons,
+            stream, self.stamps_ns[rows], self.values[rows, : WIDTH[stream]],
+            covariance=Covariances(given.distinct, index), frames=self.frames[rows], arrival=rows,
+            refused=self.refused[rows], reasons=self._reasons,
         )  # fmt: skip

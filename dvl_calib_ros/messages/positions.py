@@ -40,8 +40,10 @@ Place = tuple[float, float, float]
 class PositionType(NamedTuple):
     """Functions that read positions from messages of a type.
 
-    is_valid: message -> whether it has a position. place: message -> three numbers. covariance: message -> of east,
-    north, up, 9 numbers or 36 of a pose, m²; None if not given. between: two places -> vector from one to the other, m.
+    is_valid: message -> whether it has a position.
+    place: message -> three numbers.
+    covariance: message -> of east, north, up, 9 numbers or 36 of a pose, m²; None if not given.
+    between: two places -> vector from one to the other, m.
     has_height: whether the vertical is as accurate as the horizontal.
     """
 

@@ -103,15 +103,17 @@ def water_of(readings: Sequence[OfWater], dvl: str) -> Water | None:
         low, middle, high = np.percentile(wet.values, (5.0, 50.0, 95.0)).tolist()
         known |= {"temperature": middle, "source": wet.topic}
         known["temperature_error"] = max(THERMOMETER, 2.0 * wet.std) + 0.5 * (high - low)
-    salinity = _middle([each for each in by_kind.get("salinity", []) if each.values.any()])  # 0 throughout: not filled
+    salinity = _middle(
+        [reading for reading in by_kind.get("salinity", []) if reading.values.any()]
+    )  # all 0: not filled
     if SALINITIES[0] <= salinity <= SALINITIES[1] + 5.0:
         known["salinity"] = salinity
     pressure = _middle(by_kind.get("pressure", []))
     if not math.isnan(pressure):
         known["depth"] = max(0.0, (pressure - _SURFACE_PA) / _PA_PER_M)
-    own = [each for each in by_kind.get("used", []) if each.topic == dvl] or by_kind.get("used", [])
-    used = _middle(own)
-    if _SPEEDS[0] <= used <= _SPEEDS[1] and np.ptp(own[0].values) <= _STEADY * used:
+    of_dvl = [reading for reading in by_kind.get("used", []) if reading.topic == dvl] or by_kind.get("used", [])
+    used = _middle(of_dvl)
+    if _SPEEDS[0] <= used <= _SPEEDS[1] and np.ptp(of_dvl[0].values) <= _STEADY * used:
         known["used"] = used
     return Water(**known) if "temperature" in known or "used" in known else None
 
@@ -123,13 +125,13 @@ def _middle(readings: Sequence[OfWater]) -> float:
 
 def _in_water(readings: Sequence[OfWater]) -> OfWater | None:
     """Return the readings of the thermometer in the water; None if it is unclear which that is."""
-    words = [set(re.split("[^a-z]+", each.topic.lower())) for each in readings]
-    maybe = [(each, own) for each, own in zip(readings, words, strict=True) if not own & _NOT_IN_WATER]
-    named = [each for each, own in maybe if own & _IN_WATER]
-    chosen = named or [each for each, _ in maybe]
+    words = [set(re.split("[^a-z]+", reading.topic.lower())) for reading in readings]
+    possible = [(reading, word) for reading, word in zip(readings, words, strict=True) if not word & _NOT_IN_WATER]
+    named = [reading for reading, word in possible if word & _IN_WATER]
+    chosen = named or [reading for reading, _ in possible]
     if not chosen or (len(chosen) > 1 and not named):
         return None
-    middles = [float(np.median(each.values)) for each in chosen]
+    middles = [float(np.median(reading.values)) for reading in chosen]
     if max(middles) - min(middles) > _AGREE or not TEMPERATURES[0] <= middles[0] <= TEMPERATURES[1]:
         return None
     return chosen[0]

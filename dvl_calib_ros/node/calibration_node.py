@@ -317,7 +317,7 @@ class CalibrationNode(AnsweringNode):
     def deliver(self, ready: Collection[Subscription] | None = None) -> None:
         """Feed all waiting messages. ready: the only subscriptions with waiting messages, if known."""
         inputs = self._inputs.items()
-        self._deliver({}, None if ready is None else [topic for topic, each in inputs if each in ready])
+        self._deliver({}, None if ready is None else [topic for topic, subscription in inputs if subscription in ready])
 
     def _deliver(self, taken: Mapping[str, Arrived], ready: Collection[str] | None = None) -> None:
         """Feed the messages taken, by topic, and all waiting ones."""
@@ -425,7 +425,7 @@ class CalibrationNode(AnsweringNode):
             return
         # A subscriber would use the mounting of a wrong configuration. Waiting messages are not examined, so check
         # every time.
-        if calibrator.suggestion_so_far or any(each.severity is Severity.REJECT for each in calibrator.doubts_so_far):
+        if calibrator.suggestion_so_far or any(doubt.severity is Severity.REJECT for doubt in calibrator.doubts_so_far):
             return
         self._mounting_published = state_of
         stamp = Time()
@@ -469,7 +469,7 @@ class CalibrationNode(AnsweringNode):
     def _read_water(self) -> None:
         subscribed = [subscription.topic_name for subscription in self._inputs.values()]
         dvl = (self._inputs["dvl/twist"].topic_name, self._feed.decoder.dvl_type.name, self._newest_dvl)
-        self._water, self._newest_dvl = self._water_heard.hear(subscribed, dvl), None
+        self._water, self._newest_dvl = self._water_heard.update(subscribed, dvl), None
 
     def _topic_problems(self) -> list[Reason]:
         """Return the problems with publishers and subscribers of all topics."""

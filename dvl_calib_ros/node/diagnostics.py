@@ -142,9 +142,9 @@ class Silence:
         }
         # the newest sample of a live stream may be some time old
         faults = {}
-        for each in arrival_offset(ahead, parameters, SILENCE_S):
-            names = {"stream": _NAMED[each.stream], "side": each.side, "other": _NAMED[each.other]}
-            faults[each.stream.value] = finding("CLOCKS_DIFFER", seconds=abs(each.ahead), **names)
+        for offset in arrival_offset(ahead, parameters, SILENCE_S):
+            names = {"stream": _NAMED[offset.stream], "side": offset.side, "other": _NAMED[offset.other]}
+            faults[offset.stream.value] = finding("CLOCKS_DIFFER", seconds=abs(offset.ahead), **names)
         return faults
 
 
@@ -161,8 +161,12 @@ def diagnose(
 ) -> DiagnosticStatus:
     """Return the status of the running calibration, still without a name.
 
-    dvl_type: type of the DVL's messages. problems: further problems. now_s: steady clock. pauses_s: recent pauses of
-    this process. card: further values for the operator. water: water properties, if known.
+    dvl_type: type of the DVL's messages.
+    problems: further problems.
+    now_s: steady clock.
+    pauses_s: recent pauses of this process.
+    card: further values for the operator.
+    water: water properties, if known.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     growth = recent.grown(counts, now_s)
@@ -176,14 +180,14 @@ def diagnose(
     if suggestion := calibrator.suggestion_so_far:
         found.append(finding("CONFIGURATION_WRONG", says=suggestion))
     doubts = calibrator.doubts_so_far
-    rejected = bool(suggestion) or any(each.severity is Severity.REJECT for each in doubts)
+    rejected = bool(suggestion) or any(doubt.severity is Severity.REJECT for doubt in doubts)
     verdict = Severity.REJECT if rejected else calibrator.verdict_so_far
     # a reason to reject in a replay is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
     if verdict is Severity.ACCEPT:
         found = of_consequence(found, calibrator.parameters.target_drift)
-    if any(each.code == "REFERENCE_FRAME" for each in problems):  # the receiver works: its messages are refused
-        found = [each for each in found if not each.code.startswith("GNSS_OUTAGE")]
+    if any(problem.code == "REFERENCE_FRAME" for problem in problems):  # the receiver works: its messages are refused
+        found = [doubt for doubt in found if not doubt.code.startswith("GNSS_OUTAGE")]
     found.sort(key=lambda each: (each.severity is not Severity.ERROR, each.code not in _CAUSES))
     status = DiagnosticStatus(level=_status_level(found), hardware_id="dvl")
     status.message = printable("; ".join(map(str, found))) or f"{estimate.model} {estimate.convergence.value}"
@@ -203,16 +207,16 @@ def diagnose(
         **_cause_values(cause_of_scale(MODELS[estimate.model], estimate.of_recording, calibrator.parameters, water)),
         **({} if card is None else card.values(calibrator, estimate, counts, now_s, rejected)),
     }
-    for number, each in enumerate(found, start=1):
-        values[f"finding {number}"] = str(each)
+    for number, reason in enumerate(found, start=1):
+        values[f"finding {number}"] = str(reason)
     status.values = [KeyValue(key=key, value=printable(str(value))) for key, value in values.items()]
     return status
 
 
-def _status_level(found: Sequence[Reason]) -> bytes:
-    if not found:
+def _status_level(reasons: Sequence[Reason]) -> bytes:
+    if not reasons:
         return DiagnosticStatus.OK
-    return DiagnosticStatus.ERROR if found[0].severity is Severity.ERROR else DiagnosticStatus.WARN
+    return DiagnosticStatus.ERROR if reasons[0].severity is Severity.ERROR else DiagnosticStatus.WARN
 
 
 def _restart_advice(counts: Counts) -> list[Reason]:
@@ -224,7 +228,7 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     values = {}
     model, std = MODELS[estimate.model], estimate.std
     by_filter = dict(zip(estimate.state_names, estimate.filter_std.tolist(), strict=True))
-    units = {each.name: each.unit for each in model.nuisance}
+    units = {spec.name: spec.unit for spec in model.nuisance}
     for entry in estimate.observability:
         name = entry.name
         index = estimate.state_names.index(name)

@@ -27,12 +27,13 @@ class _Waiting:
     """Wait set with the node's current entities and a guard condition."""
 
     def __init__(self, node: CalibrationNode, woken: GuardCondition) -> None:
+        """Add all entities of the node to a new wait set. woken: guard condition that ends a wait."""
         self.inputs = list(node.inputs)
         others = [
-            each
-            for each in node.subscriptions
+            subscription
+            for subscription in node.subscriptions
             # subscriptions that no executor serves are polled elsewhere
-            if each not in self.inputs and each.callback_group.can_execute(each)
+            if subscription not in self.inputs and subscription.callback_group.can_execute(subscription)
         ]
         self.guards, self.waitables = list(node.guards), list(node.waitables)
         kinds: list[tuple[str, list[Any]]] = [
@@ -42,7 +43,7 @@ class _Waiting:
             ("client", list(node.clients)),
             ("service", list(node.services)),
         ]
-        inside = [sum(getattr(each.get_num_entities(), name) for each in self.waitables) for name in _COUNTS]
+        inside = [sum(getattr(waitable.get_num_entities(), name) for waitable in self.waitables) for name in _COUNTS]
         sizes = [own + within for own, within in zip([*(len(each) for _, each in kinds), 0], inside, strict=True)]
         self._wait_set = rclpy_implementation.WaitSet(*sizes, node.context.handle)
         self._add = [(getattr(self._wait_set, f"add_{kind}"), each.handle) for kind, all_ in kinds for each in all_]
@@ -56,7 +57,7 @@ class _Waiting:
         for waitable in self.waitables:
             waitable.add_to_wait_set(wait_set)
         wait_set.wait(timeout_ns)
-        inputs = [each for number, each in enumerate(self.inputs) if wait_set.is_ready("subscription", number)]
+        inputs = [entity for number, entity in enumerate(self.inputs) if wait_set.is_ready("subscription", number)]
         others = len(wait_set.get_ready_entities("subscription")) > len(inputs)
         others = others or any(wait_set.get_ready_entities(kind) for kind in ("timer", "client", "service"))
         if ready := wait_set.get_ready_entities("guard_condition"):
@@ -64,7 +65,7 @@ class _Waiting:
             for guard in self.guards:  # waiting has consumed the trigger that rclpy must see, too
                 if guard.handle.pointer in ready:
                     guard.trigger()
-        return inputs, others or any(each.is_ready(wait_set) for each in self.waitables)
+        return inputs, others or any(waitable.is_ready(wait_set) for waitable in self.waitables)
 
 
 class ReceivingExecutor(SingleThreadedExecutor):

@@ -36,6 +36,7 @@ class Listener:
         """Whether the last call is still unanswered."""
 
     def __enter__(self) -> Listener:
+        """Start a node that listens to /diagnostics and can call the services of the calibration node."""
         self._context = rclpy.Context()
         # without the command's own -p NAME:=VALUE, which ROS takes for a remapping and warns of on the view
         ros_arguments = list(itertools.dropwhile(lambda word: word != "--ros-args", sys.argv))

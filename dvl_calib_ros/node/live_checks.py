@@ -110,7 +110,7 @@ class Pauses:
     def within(self, seconds: float) -> list[float]:
         """Return the lengths (s) of pauses that ended within the last `seconds` of running."""
         running_s = self._last_s - self._paused_s
-        self._pauses = [each for each in self._pauses if running_s - each[0] <= seconds]
+        self._pauses = [pause for pause in self._pauses if running_s - pause[0] <= seconds]
         return [length for _, length in self._pauses]
 
     def forget(self) -> None:

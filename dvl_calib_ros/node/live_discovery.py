@@ -160,7 +160,7 @@ class Discovering:
                 found = discover(recording, self._parameters, given)
             except InputError as error:
                 raise InputError(str(error).replace(str(path), "the topics there are")) from error
-        imu = recording.survey.looks.get(found.topics.imu)
+        imu = recording.survey.previews.get(found.topics.imu)
         has_turned = imu is not None and _mean_heading_length(imu.values[:, :4]) < ONE_HEADING
         if named["dvl"] is not None and not (has_turned and "gnss_frame" in found.values):
             raise InputError("the frame of the reference is not observable yet: drive a turn, or set gnss_frame")

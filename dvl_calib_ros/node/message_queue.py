@@ -48,9 +48,11 @@ def in_order_of_arrival(
 ) -> Iterator[tuple[str, Any]]:
     """Yield topic and message of all waiting messages, oldest first; messages of one topic keep their order.
 
-    inputs: sources by topic. taken: messages already taken from some of them. at_most: limit of further messages.
+    inputs: sources by topic.
+    taken: messages already taken from some of them.
+    at_most: limit of further messages.
     ready: the only topics with messages a moment ago, if known. While these have no second message, the others are not
-    polled: an empty poll costs a third of a message.
+      polled: an empty poll costs a third of a message.
     """
     oldest_by_topic, remaining = dict(taken), at_most
 

@@ -34,20 +34,20 @@ def velocity_class(parameter: str, name: str, dvl_fields: str = "") -> Any:
     dvl_fields: value of the parameter of that name. Raises InputError for an unusable type, or if its package is
     missing.
     """
-    package, _, rest = name.partition("/")
-    full = f"{package}/msg/{rest.removeprefix('msg/')}"
+    package, _, type_name = name.partition("/")
+    full = f"{package}/msg/{type_name.removeprefix('msg/')}"
     if dvl_fields and may_be_mapped(full):
-        found = message_class(parameter, full)
-        read = mapped_type(full, dvl_fields).adapted
+        kind = message_class(parameter, full)
+        adapted = mapped_type(full, dvl_fields).adapted
         try:
-            assert read is not None
-            read(found())  # an empty message has all fields
+            assert adapted is not None
+            adapted(kind())  # an empty message has all fields
         except UNREADABLE as error:
             raise InputError(f"dvl_fields: {dvl_fields!r} does not fit {full}: {error}") from error
         name = full
     elif parameter == "dvl_type" and name not in VELOCITY_TYPES and may_be_recognised(name):
-        found = message_class(parameter, full)
-        recognised(full, found.get_fields_and_field_types())
+        kind = message_class(parameter, full)
+        recognised(full, kind.get_fields_and_field_types())
         name = full
     return message_class(parameter, velocity_type(parameter, name).name)
 

@@ -11,13 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.assessment.manoeuvre_planner import (
-    Outlook,
-    RecentMotion,
-    is_good_enough,
-    noise_of_a_second,
-    outlook,
-)
+from ..calibration.assessment.manoeuvre_planner import Outlook, RecentMotion, is_good_enough, noise_of_a_second, outlook
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.observability import KM, PredictedDrift, predicted_drift
 from ..calibration.models import MODELS
@@ -50,31 +44,31 @@ class RecentWorth:
 
     def __init__(self) -> None:
         self._model = ""
-        self._looks: deque[tuple[float, PredictedDrift]] = deque()
+        self._drifts: deque[tuple[float, PredictedDrift]] = deque()
         self._within_since_s: float | None = None
         self.is_good = False
         self.taken_back: Reason | None = None
 
-    def look(self, model: str, drift: PredictedDrift, target: float, now_s: float, rejected: bool) -> PredictedDrift:
+    def add(self, model: str, drift: PredictedDrift, target: float, now_s: float, rejected: bool) -> PredictedDrift:
         """Add a prediction and return the displayed drift, the median of the recent ones.
 
         now_s: time by DVL stamps. rejected: whether a replay would reject the calibration.
         """
         was_good = self.is_good
         if rejected or model != self._model:
-            self._looks.clear()
+            self._drifts.clear()
             self._model, self._within_since_s, self.is_good = model, None, False
             if rejected:
                 self.taken_back = None  # the findings say why
             elif was_good:
                 self.taken_back = finding("WORTH_OF_ANOTHER_MODEL", model=model)
-        if self._looks and self._looks[-1][0] == now_s:
-            self._looks.pop()
-        self._looks.append((now_s, drift))
-        while self._looks[0][0] < now_s - STANDS_S:
-            self._looks.popleft()
+        if self._drifts and self._drifts[-1][0] == now_s:
+            self._drifts.pop()
+        self._drifts.append((now_s, drift))
+        while self._drifts[0][0] < now_s - STANDS_S:
+            self._drifts.popleft()
         predicted = PredictedDrift(
-            *(sorted(each)[len(each) // 2] for each in zip(*(d for _, d in self._looks), strict=True))
+            *(sorted(drifts)[len(drifts) // 2] for drifts in zip(*(d for _, d in self._drifts), strict=True))
         )
         if self.is_good and predicted.both > WITHDRAWN_RATIO * target:
             self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=predicted.both)
@@ -99,12 +93,16 @@ class RemainingTime:
 
     def __init__(self) -> None:
         self._ends_s: deque[tuple[float, float]] = deque()  # time of each prediction, and the predicted end
-        self._latest_s, self._longer_since_s = math.inf, -math.inf  # latest promised end
-        self._promised_at = math.nan  # drift when it was promised
+        self._latest_s, self._longer_since_s = math.inf, -math.inf  # latest predicted end
+        self._drift_then = math.nan  # m per km, when that end was predicted
         self.longer: Reason | None = None
 
-    def look(self, seconds: float | None, drift: float, now_s: float) -> float | None:
-        """Add a prediction (s; None: unknown). Return the median remaining time, s. drift: m per km, as displayed."""
+    def add(self, seconds: float | None, drift: float, now_s: float) -> float | None:
+        """Add a prediction, and return the median of the last predictions of the remaining time, s.
+
+        seconds: predicted remaining time, None if unknown. drift: predicted drift, m per km, as displayed.
+        If the median end is later than any end predicted before, `longer` tells why.
+        """
         if now_s - self._longer_since_s >= STANDS_S:
             self.longer = None
         self._ends_s.append((now_s, math.inf if seconds is None else now_s + seconds))
@@ -114,10 +112,10 @@ class RemainingTime:
         remaining = max(end_s - now_s, 0.0)
         latest_s = end_s + SPREAD * remaining
         if end_s > self._latest_s:
-            code = "LONGER_AS_DRIFT_GREW" if drift > self._promised_at else "LONGER_AS_LITTLE_SHOWN"
-            self.longer, self._longer_since_s = finding(code, before=self._promised_at, now=drift), now_s
+            code = "LONGER_AS_DRIFT_GREW" if drift > self._drift_then else "LONGER_AS_LITTLE_SHOWN"
+            self.longer, self._longer_since_s = finding(code, before=self._drift_then, now=drift), now_s
         if latest_s < self._latest_s or end_s > self._latest_s:
-            self._latest_s, self._promised_at = latest_s, drift
+            self._latest_s, self._drift_then = latest_s, drift
         return remaining if math.isfinite(remaining) else None
 
 
@@ -125,16 +123,17 @@ class Card:
     """Values of successive statuses. now_s: monotonic time."""
 
     def __init__(self, now_s: float) -> None:
+        """Start without statuses."""
         self._began_s = now_s
         self._received: deque[tuple[float, Mapping[str, int]]] = deque(maxlen=RATED_OVER)
-        self._came_s: dict[str, float] = {}
-        self._driven_s = dict.fromkeys(SECTORS, 0.0)
+        self._came_s: dict[str, float] = {}  # time of each stream's newest message
+        self._driven_s = dict.fromkeys(SECTORS, 0.0)  # time on each course
         self._newest_ns: int | None = None
         self._shown_s = 0.0
-        self._squares, self._looks = 0.0, 0
+        self._squared_speeds, self._n_speeds = 0.0, 0
         self._worth, self._remaining = RecentWorth(), RemainingTime()
         self._outlook: Outlook | None = None
-        self._planned_s = self._planned_shown_s = -math.inf
+        self._planned_s = self._planned_shown_s = -math.inf  # when `_outlook` was computed: by the clock, by DVL stamps
 
     def values(
         self,
@@ -180,13 +179,13 @@ class Card:
         motion, step = calibrator.latest_motion(), self._dvl_time_step(calibrator.last_ns)
         self._shown_s += step
         if motion is not None and motion.speed > 0.0:
-            self._squares, self._looks = self._squares + motion.speed**2, self._looks + 1
+            self._squared_speeds, self._n_speeds = self._squared_speeds + motion.speed**2, self._n_speeds + 1
             if motion.heading is not None:
                 sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
                 self._driven_s[SECTORS[sector]] += step
         target, worth = parameters.target_drift, self._worth
         predicted = predicted_drift(model, estimate.velocity_covariance, parameters)
-        drift = worth.look(model.name, predicted, target, self._shown_s, rejected)
+        drift = worth.add(model.name, predicted, target, self._shown_s, rejected)
         if rejected:
             plan = Outlook(finding("NEXT_REJECTED"), None)
         elif worth.is_good:
@@ -201,7 +200,7 @@ class Card:
         if rejected or worth.is_good:
             self._remaining = RemainingTime()
         elif plan.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
-            remaining = self._remaining.look(plan.seconds, drift.both, self._shown_s)
+            remaining = self._remaining.add(plan.seconds, drift.both, self._shown_s)
         initial = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goal = PredictedDrift.goals(parameters)
         goals = {
@@ -229,7 +228,7 @@ class Card:
         """Return the suggested manoeuvre, computed again after `REPLANNED_EVERY_S`."""
         if self._outlook is None or now_s - self._planned_s >= REPLANNED_EVERY_S:
             self._planned_s, self._planned_shown_s = now_s, self._shown_s
-            parameters, mean_square = calibrator.parameters, self._squares / max(self._looks, 1)
+            parameters, mean_square = calibrator.parameters, self._squared_speeds / max(self._n_speeds, 1)
             first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
             seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
             noise = noise_of_a_second(estimate, parameters, seconds, mean_square)

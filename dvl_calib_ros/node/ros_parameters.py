@@ -56,7 +56,7 @@ def declare_parameters(node: AnsweringNode, files: Sequence[Path] = ()) -> Param
         node.undeclare_parameter(name)
     ignored = sorted(names_elsewhere & given.keys())
     if ignored:
-        node.info(f"not ours, though set for all nodes: {', '.join(ignored)}")
+        node.info(f"set for all nodes, but no parameters of this node: {', '.join(ignored)}")
     parameters = Parameters.from_mapping({name: value for name, value in given.items() if name not in names_elsewhere})
     for name, spec in SCHEMA.items():
         node.declare_parameter(name, parameters.as_dict()[name], descriptor(spec), ignore_override=True)
@@ -67,11 +67,11 @@ def declare_parameters(node: AnsweringNode, files: Sequence[Path] = ()) -> Param
 def _as_declared(parameters: Sequence[Parameter]) -> list[Parameter]:
     """Return parameters with integers converted to doubles, which ROS 2 would refuse by their type."""
     found = []
-    for each in parameters:
-        kind = SCHEMA[each.name].kind if each.name in SCHEMA else ""
-        if kind == "double" and each.type_ is Parameter.Type.INTEGER:
-            each = Parameter(each.name, Parameter.Type.DOUBLE, float(each.value))
-        elif kind == "double_array" and each.type_ is Parameter.Type.INTEGER_ARRAY:
-            each = Parameter(each.name, Parameter.Type.DOUBLE_ARRAY, [*map(float, each.value)])
-        found.append(each)
+    for parameter in parameters:
+        kind = SCHEMA[parameter.name].kind if parameter.name in SCHEMA else ""
+        if kind == "double" and parameter.type_ is Parameter.Type.INTEGER:
+            parameter = Parameter(parameter.name, Parameter.Type.DOUBLE, float(parameter.value))
+        elif kind == "double_array" and parameter.type_ is Parameter.Type.INTEGER_ARRAY:
+            parameter = Parameter(parameter.name, Parameter.Type.DOUBLE_ARRAY, [*map(float, parameter.value)])
+        found.append(parameter)
     return found

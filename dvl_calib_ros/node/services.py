@@ -38,7 +38,7 @@ class AnsweringNode(Node):  # type: ignore[misc]
                 return _printable(callback(request, response))
             except Exception as error:  # rclpy raises ValueError for an unknown parameter type
                 why = f"{type(error).__name__}: {error}"
-                self.error(f"{srv_name}: a request cannot be answered ({why}); nothing more of it is done")
+                self.error(f"{srv_name}: a request cannot be answered ({why}); the request is dropped")
                 return srv_type.Response()
 
         return super().create_service(srv_type, srv_name, answer, **options)

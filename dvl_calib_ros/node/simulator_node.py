@@ -73,7 +73,7 @@ class SimulatorNode(AnsweringNode):
     @property
     def is_heard(self) -> bool:
         """Return whether every topic has a subscriber."""
-        return all(each.get_subscription_count() > 0 for each in (self._dvl, self._gnss, self._imu))
+        return all(publisher.get_subscription_count() > 0 for publisher in (self._dvl, self._gnss, self._imu))
 
     def publish(self, samples: Sequence[Sample]) -> None:
         """Publish samples, in order."""
@@ -90,8 +90,8 @@ class SimulatorNode(AnsweringNode):
 
     def finish(self) -> None:
         """Wait until subscribers have received all messages."""
-        for each in (self._dvl, self._gnss, self._imu):
-            each.wait_for_all_acked(PATIENCE)
+        for publisher in (self._dvl, self._gnss, self._imu):
+            publisher.wait_for_all_acked(PATIENCE)
 
     def follow(self, topic: str, scenario: Scenario) -> None:
         """Publish the sensors' measurements on the motion of an odometry topic. Raises InputError."""

@@ -38,7 +38,7 @@ class TopicRecorder:
     @property
     def topics(self) -> list[str]:
         """Recorded topics that are not static."""
-        return [each.topic_name for each in self._subscriptions if each.topic_name not in self._static]
+        return [heard.topic_name for heard in self._subscriptions if heard.topic_name not in self._static]
 
     def look(self) -> bool:
         """Subscribe to new topics. Return whether there are any."""
@@ -60,9 +60,9 @@ class TopicRecorder:
         publishers = self._node.get_publishers_info_by_topic(topic)
         if is_static(topic, kind) or not publishers:
             self._static.add(topic)
-        is_reliable = all(each.qos_profile.reliability is ReliabilityPolicy.RELIABLE for each in publishers)
+        is_reliable = all(publisher.qos_profile.reliability is ReliabilityPolicy.RELIABLE for publisher in publishers)
         is_latched = bool(publishers) and all(
-            each.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for each in publishers
+            publisher.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for publisher in publishers
         )
         profile = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
@@ -82,8 +82,8 @@ class TopicRecorder:
 
     def close(self) -> None:
         """Stop receiving."""
-        for each in self._subscriptions:
-            self._node.destroy_subscription(each)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
         self._subscriptions = []
 
     def _write_message(self, channel: Channel, data: bytes) -> None:

@@ -29,6 +29,7 @@ class Transforms:
     """Subscriber to transforms. `n_messages` counts its messages, so that callers can skip an unchanged tree."""
 
     def __init__(self, node: Node) -> None:
+        """Subscribe to /robot_description, and to /tf_static if its message package is installed."""
         self._transforms: dict[str, Any] = {}
         self._own: deque[Any] = deque(maxlen=OWN_TRANSFORMS)
         self._description = ""
@@ -52,10 +53,10 @@ class Transforms:
 
     def _on_transforms(self, message: Any) -> None:
         """Keep the newest transform of each child frame, except this node's own."""
-        others = [each for each in message.transforms if each not in self._own]
-        for each in others:
+        others = [transform for transform in message.transforms if transform not in self._own]
+        for other in others:
             if len(self._transforms) < MOST_TRANSFORMS:
-                self._transforms[each.child_frame_id] = each
+                self._transforms[other.child_frame_id] = other
         self.n_messages += bool(others)
 
     def own(self, transform: Any) -> None:
@@ -78,6 +79,7 @@ class MountingOutput:
     """
 
     def __init__(self, node: Any, publisher: Any, broadcasts: bool, warn: Callable[[str], None]) -> None:
+        """Set up. broadcasts: also publish a TF transform. warn: receives a warning if tf2_ros is missing."""
         self._publisher = publisher
         self._broadcaster: Any = None
         self._unknown_in = ""

@@ -44,13 +44,13 @@ class WaterHeard:
         self._collectors: dict[tuple[str, str], WaterCollector] = {}
         self._seconds = 0
 
-    def hear(self, own: Collection[str], dvl: tuple[str, str, Any]) -> Water | None:
+    def update(self, received: Collection[str], dvl: tuple[str, str, Any]) -> Water | None:
         """Return the known water properties; called once a second.
 
-        own: topics that the node already receives. dvl: topic, type and newest message of the DVL, None for none.
+        received: topics that the node already receives. dvl: topic, type and newest message of the DVL, None for none.
         """
         if self._looks_for and self._seconds % LOOK_S == 0:
-            self._look(own)
+            self._subscribe_new(received)
         self._seconds += 1
         for key, subscription in self._subscriptions.items():
             if (arrived := take(subscription)) is not None:
@@ -58,16 +58,16 @@ class WaterHeard:
         topic, kind, message = dvl
         if message is not None and readers(topic, kind):
             self._collector(topic, kind).add(message)
-        return water_of([each for one in self._collectors.values() for each in one.readings()], topic)
+        return water_of([reading for one in self._collectors.values() for reading in one.readings()], topic)
 
     def _collector(self, topic: str, kind: str) -> WaterCollector:
         return self._collectors.setdefault((topic, kind), WaterCollector(topic, kind, READINGS))
 
-    def _look(self, own: Collection[str]) -> None:
+    def _subscribe_new(self, received: Collection[str]) -> None:
         """Subscribe to new topics with water properties."""
         for topic, kinds in self._node.get_topic_names_and_types():
             for kind in kinds:
-                if topic in own or (topic, kind) in self._subscriptions or not readers(topic, kind):
+                if topic in received or (topic, kind) in self._subscriptions or not readers(topic, kind):
                     continue
                 try:
                     class_ = message_class(topic, kind)

@@ -97,8 +97,8 @@ def shown_quantities(result: Comparison) -> list[ComparedQuantity]:
 
 
 DIFFERENCES_NOTE = (
-    "Angles as in a URDF. p: probability under no change that the most significant of angles and lever arm is as "
-    "large, corrected for the number of tests."
+    "Angles as in a URDF. p: probability of so significant a difference of angles or lever arm without a change, "
+    "corrected for the number of tests."
 )
 
 

@@ -40,8 +40,8 @@ from .document import (
 from .numbers import intervals, mm, p_value, quantity, share, three, two, with_std
 
 NOISE_MEANING = {
-    "outliers": "samples far outside the noise, as a share",
-    "stale_samples": "samples that repeat the one before, as a share",
+    "outliers": "share of samples far outside the noise",
+    "stale_samples": "share of samples that repeat the previous one",
     "noise_inflation": "the noise is larger than reported, or grows with speed or turn rate",
     "reported_covariance": "how the noise follows covariances that differ by sample: 1 as claimed, 0 not at all",
     "coloured_reference_noise": "the noise has a memory",
@@ -50,7 +50,7 @@ ALL = "all of the run"
 MAX_PLACES = 12
 # effects on the first screen of a terminal
 FIRST_EFFECTS = 3
-PLACES = "Share: of the gap's energy. Places overlap, so that only the shares of the axes over all of the run add up."
+PLACES = "Share: of the gap's energy. Places overlap; only the axes, over the whole run, add up to all of it."
 EFFECTS_NOTE = (
     "The calibration is refitted with every effect. p is adjusted for all effects tried. For names joined by "
     "“or”, the parameters are those of the first."
@@ -159,7 +159,7 @@ def diagnosis(d: Diagnosis) -> Document:
             section("", *map(Sentence, _drift_sentences(d)), where=Where.PAGE),
             section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
             section("", Warned(), where=Where.PAGE),
-            section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
+            section("Which effects cause it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
             section("", Table(("effect", "recording", "parameters (95 %)"), by_recording, words=3)),
             section("", closed if has_effects and math.isfinite(d.gap.closure) else None, where=Where.PAGE),
             section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
@@ -210,7 +210,7 @@ def _equivalence_sentences(d: Diagnosis) -> Iterator[Sentence]:
             value, low, high = known.value
             sign = "-" if known.speed > 0.0 else "+"
             yield Sentence(
-                f"Known of both is lever_arm {known.parameter} {sign} {abs(known.speed):.2f} m/s · {known.clock} = "
+                f"Observable is only lever_arm {known.parameter} {sign} {abs(known.speed):.2f} m/s · {known.clock} = "
                 f"{value:.2f} m ({low:.2f} to {high:.2f})."
             )
 
@@ -233,7 +233,7 @@ def _main_numbers(d: Diagnosis) -> list[Number]:
         note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=note))
     reported = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white and slow, by likelihood{reported}"))
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white plus slow, by likelihood{reported}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="beyond the noise")]
 
 

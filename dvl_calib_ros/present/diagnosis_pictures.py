@@ -288,7 +288,7 @@ def trace_pictures(name: str, series: DiagnosisSeries, axes: Mapping[str, str]) 
         if smooth_energy[axis] > AXIS_SHARE * sum(smooth_energy):
             lines = {"measured": measured[:, axis], name: trace[:, axis]}
             yield picture(
-                f"{name}, {where}", f"Measured trace {where} and the trace of {name}, running mean in mm/s",
+                f"{name}, {where}", f"Measured error {where} and the error caused by {name}, running mean in mm/s",
                 over_time, time, stamps_ns, lines, points, f"{where}, mm/s",
             )  # fmt: skip
     drawn = energy > AXIS_SHARE * energy.sum()

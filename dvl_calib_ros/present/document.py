@@ -116,9 +116,10 @@ class Table(_Printable):
         return (self.transposed if is_wide else None) or self
 
     def frame(self) -> pandas.DataFrame:
-        """Return a DataFrame, in which columns of σ and observability (no ?) follow a numeric column.
+        """Return a DataFrame with the values as numbers.
 
-        Other columns are texts. Raises ImportError without pandas.
+        A column whose texts are all numbers becomes one numeric column, followed by columns of σ (texts with ±) and of
+        observability (texts with ?). Other columns stay texts. Raises ImportError without pandas.
         """
         import pandas
 
@@ -332,8 +333,10 @@ class Answer(_Printable):
 class Document(_Printable):
     """Presentation of a result.
 
-    sections: in order; empty ones are omitted. parameters: parameters of the run by name, for the page. lead: a finding
-    before all others. folded: warnings that a page folds away.
+    sections: in order; empty ones are omitted.
+    parameters: parameters of the run by name, for the page.
+    lead: a finding before all others.
+    folded: warnings that a page folds away.
     """
 
     title: str

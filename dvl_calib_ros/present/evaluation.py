@@ -113,7 +113,7 @@ def evaluation(e: Evaluation) -> Document:
             section("Velocity error after calibration", *_scores(e)),
             _error_by_time(e),
             *([_convergence(e)] if e.convergence else []),
-            section("What was done before", baselines),
+            section("Earlier methods", baselines),
             *(
                 section(f"Can the uncertainty be trusted? {title}", *_coverage(found))
                 for title, found in coverages
@@ -238,7 +238,7 @@ def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
         rows.append((coverage.model, *pooled, *(shares.get(name, "–") for name in states), str(coverage.n_errors)))
     named = [re.sub("^(phi_|delta_k_?)", lambda found: SYMBOLS[found[0]], name) for name in states]
     yield Table(
-        ("model", "68 % interval", "95 % interval", *named, "errors each"),
+        ("model", "68 % interval", "95 % interval", *named, "number of errors per state"),
         rows,
         notes=(
             "Per cent of the errors (estimate minus truth) inside the interval that σ claims, over all states and for "
@@ -335,7 +335,11 @@ DRIFT_NOTE = (
 
 
 def cross_check(check: CrossCheck) -> Document:
-    """Lay out the errors of each bag's calibration on every other bag."""
+    """Lay out the errors of each bag's calibration on every other bag.
+
+    Rows: calibrating bags and models. Columns: bags that are corrected. First drift of dead reckoning, with a picture
+    per bag, then the velocity error.
+    """
     heading, uncalibrated = ("calibrated on", "model", *check.names), ("nothing", "uncalibrated")
     errors = [(*uncalibrated, *(number(value, 4) for value in check.uncorrected.tolist()))]
     for name, by_model in zip(check.names, check.corrected, strict=True):
@@ -370,16 +374,16 @@ def cross_check(check: CrossCheck) -> Document:
         sections=[
             section(
                 "",
-                Sentence("Each bag calibrates, and every other one that has a reference is corrected with that."),
+                Sentence("Each bag calibrates; all other bags with a reference are corrected with the result."),
                 where=Where.PAGE,
             ),
             section(
-                "Dead reckoning on bags that were not calibrated on",
+                "Dead reckoning on the other bags",
                 Table(heading, drift_rows if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
                 *pictures,
             ),
             section(
-                "Difference of DVL and GNSS on bags that were not calibrated on",
+                "Difference of DVL and GNSS on the other bags",
                 Table(heading, errors, dense=True, notes=(ERRORS_NOTE,), words=2),
             ),
             section("", *(Sentence(each, soft=True) for each in check.found)),

@@ -138,8 +138,9 @@ LEFT_SHARE = 0.02
 class TimeAxis:
     """Conversion of stamps to plot positions.
 
-    breaks: (B, 2) start and end of omitted time, in the unit of the axis. label: with the unit. run: name for figures
-    that share a cursor.
+    breaks: (B, 2) start and end of omitted time, in the unit of the axis.
+    label: with the unit.
+    run: name for figures that share a cursor.
     """
 
     def __init__(self, stamps_ns: ArrayLike) -> None:

@@ -211,7 +211,7 @@ PERSONS: Columns[NeedsPerson] = {
     ),
 }
 COMPASS_NOTE = (
-    "Error of the heading reference with the yaw (from east, to the left), ±1σ; a constant is part of the mounting."
+    "Error of the heading reference by yaw (0 is east, counter-clockwise), ±1σ; a constant is in the mounting."
 )
 COMPASS: Columns[tuple[str, CompassDeviation]] = {
     "": lambda each: each[0],

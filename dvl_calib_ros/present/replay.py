@@ -241,7 +241,7 @@ def straight_kilometre(result: Result) -> tuple[float, float]:
 def _verdict_answer(verification: Verification | None) -> Answer:
     """Return the verdict of the held-out data with its reasons and advice."""
     if verification is None:
-        return Answer("not verified", Severity.MARGINAL, ["Nothing was held back to verify the calibration on."])
+        return Answer("not verified", Severity.MARGINAL, ["No data were held back to verify the calibration."])
     reasons = [*verification.reasons]
     if verification.mounting is not None and verification.verdict is not Severity.REJECT:
         reasons.append(verification.mounting)

@@ -280,8 +280,9 @@ def navigation_pictures(
 ) -> Sequence[Picture]:
     """Draw a map, if headings are known, and the error along the track.
 
-    one: its reference and uncorrected track are drawn. corrected: tracks by their correction ('' for a single one); the
-    first four are drawn. stamps_ns: of figures whose cursor the map follows.
+    one: its reference and uncorrected track are drawn.
+    corrected: tracks by their correction ('' for a single one); the first four are drawn.
+    stamps_ns: of figures whose cursor the map follows.
     """
     ends = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
     alt = f"over {one.distance_m:.0f} m; error at the end: as mounted {one.before.end:.1f} m; {ends}"
@@ -514,7 +515,7 @@ def data_pictures(result: Result, history: RunHistory, models: Sequence[str]) ->
         picture(
             "Samples by model", "How many DVL samples each model used, gated or was not given",
             samples_by_fate, list(models), fates,
-            caption="Not given: without the GNSS velocity or attitude it needs, or in the window of its prior.",
+            caption="Not given: samples without a GNSS velocity or attitude, or in the window of the prior.",
         ),
         picture(
             "Selected model and GNSS", f"Which model was selected over time: {switches}; and when GNSS was there",

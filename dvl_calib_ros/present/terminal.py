@@ -36,6 +36,7 @@ class Folding:
         self._transposed = transposed
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the table as it is if it fits; else transposed, in groups of columns, or with one cell per line."""
         table, width = self._table, options.max_width
         needed = [_keep_short(console, options, column) for column in table.columns]
         if sum(needed) + 1 <= width:

@@ -106,7 +106,7 @@ def noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
             }
             yield picture(
                 f"Residual by frequency, {name} of the DVL",
-                f"Amplitude spectral density of what each side's own explanation leaves on {name}", spectra, lines,
+                f"Amplitude spectral density of each side's residual on {name}", spectra, lines,
             )  # fmt: skip
 
 

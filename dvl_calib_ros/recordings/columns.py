@@ -27,16 +27,20 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 @dataclass(frozen=True)
-class Laid:
-    """N messages of a fixed layout, in order of arrival.
+class DecodedRows:
+    """N messages of a fixed layout, decoded together, in order of arrival.
 
-    arrival: (N,) positions among all messages read. log_ns: (N,). stamps_ns: (N,) of the header, 0 if missing. values:
-    (N, 3) velocity, m/s, in the message's axes; of an IMU (N, 7) quaternion (x, y, z, w) and angular velocity, rad/s,
-    nan if missing. frame: (N,) indices into frames, the frame_ids. covariance: (N,) indices into distinct (C, 3, 3),
-    (m/s)², -1 if missing. broken: (N,) 1 + index of the first violated rule of the message type, 0 if none. beside: (N,
-    3) acceleration, m/s², of an IMU; else as `beside_velocity`. world: frame_id of the first message's header, which is
-    the pose's frame for an odometry. heading_variance: of an IMU's orientation about z, rad², of the first message; nan
-    if missing.
+    arrival: (N,) positions among all messages read.
+    log_ns: (N,).
+    stamps_ns: (N,) of the header, 0 if missing.
+    values: (N, 3) velocity, m/s, in the message's axes; of an IMU (N, 7) quaternion (x, y, z, w) and angular velocity,
+      rad/s, nan if missing.
+    frame: (N,) indices into frames, the frame_ids.
+    covariance: (N,) indices into distinct (C, 3, 3), (m/s)², -1 if missing.
+    broken: (N,) 1 + index of the first violated rule of the message type, 0 if none.
+    extra: (N, 3) acceleration, m/s², of an IMU; else as `extra_values`.
+    world: frame_id of the first message's header, which is the pose's frame for an odometry.
+    heading_variance: of an IMU's orientation about z, rad², of the first message; nan if missing.
     """
 
     arrival: Stamps
@@ -46,7 +50,7 @@ class Laid:
     frame: NDArray[np.int32]
     covariance: NDArray[np.int32]
     broken: Codes
-    beside: Array
+    extra: Array
     world: str = ""
     heading_variance: float = math.nan
     frames: tuple[str, ...] = ()
@@ -55,7 +59,7 @@ class Laid:
     def __len__(self) -> int:
         return len(self.arrival)
 
-    def part(self, at: slice | Index) -> Laid:
+    def part(self, at: slice | Index) -> DecodedRows:
         """Return the rows of a slice or of indices."""
         return replace(self, **{name: getattr(self, name)[at] for name in _DTYPES})
 
@@ -82,7 +86,7 @@ class Laid:
 
 _DTYPES: Mapping[str, Any] = {
     "arrival": np.int64, "log_ns": np.int64, "stamps_ns": np.int64, "values": np.float64, "frame": np.int32,
-    "covariance": np.int32, "broken": np.uint8, "beside": np.float64,
+    "covariance": np.int32, "broken": np.uint8, "extra": np.float64,
 }  # fmt: skip
 
 
@@ -94,8 +98,10 @@ STAMP_END = 12
 class Singles:
     """M messages that are decoded individually, in order of arrival.
 
-    arrival, log_ns: (M,). channel: (M,) indices into channels. end: (M,) end of each message in content, which is
-    bytes. is_restamped: whether log times replace the stamps.
+    arrival, log_ns: (M,).
+    channel: (M,) indices into channels.
+    end: (M,) end of each message in content, which is bytes.
+    is_restamped: whether log times replace the stamps.
     """
 
     arrival: Stamps
@@ -156,15 +162,21 @@ class Singles:
         return stamps_ns
 
     def _header_stamps_ns(self, rows: Index) -> Stamps:
-        """Read only the stamps of messages that begin with a header (CDR)."""
+        """Read only the stamps of messages that begin with a header, from their bytes (CDR).
+
+        Byte 0 is 0 and byte 1 the byte order; after the 4 bytes of this encapsulation follow seconds and nanoseconds.
+        """
         starts = np.where(rows > 0, self.end[rows - 1], 0)
         is_whole = self.end[rows] - starts >= STAMP_END
         head = self.content[np.where(is_whole, starts, 0)[:, None] + np.arange(STAMP_END if is_whole.any() else 0)]
         stamps_ns = np.zeros(len(rows), dtype=np.int64)
-        for order, flag in (("<", 1), (">", 0)):
+        for byte_order, flag in (("<", 1), (">", 0)):
             readable = is_whole & ((head[:, :1] == 0) & (head[:, 1:2] == flag)).any(axis=1)
             seconds, nanoseconds = (
-                np.ascontiguousarray(head[readable, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
+                np.ascontiguousarray(head[readable, first : first + 4])
+                .view(f"{byte_order}{kind}4")
+                .astype(np.int64)
+                .ravel()
                 for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))
             )
             stamps_ns[readable] = seconds * 1_000_000_000 + nanoseconds
@@ -177,47 +189,47 @@ class TopicColumns:
 
     topic: str
     msgtype: str
-    laid: Laid
+    decoded: DecodedRows
     singles: Singles
 
     def __len__(self) -> int:
-        return len(self.laid) + len(self.singles)
+        return len(self.decoded) + len(self.singles)
 
     @property
     def arrivals(self) -> tuple[Stamps, Stamps]:
         """Positions of all messages among all messages read, in order, and their log times (ns)."""
         if not len(self.singles):
-            return self.laid.arrival, self.laid.log_ns
-        arrival = np.concatenate([self.laid.arrival, self.singles.arrival])
+            return self.decoded.arrival, self.decoded.log_ns
+        arrival = np.concatenate([self.decoded.arrival, self.singles.arrival])
         order = np.argsort(arrival, kind="stable")
-        return arrival[order], np.concatenate([self.laid.log_ns, self.singles.log_ns])[order]
+        return arrival[order], np.concatenate([self.decoded.log_ns, self.singles.log_ns])[order]
 
     @property
     def stamps_ns(self) -> Stamps:
         """Stamps of all messages in the order of `arrivals`; the log time if missing."""
         _, log_ns = self.arrivals
-        stamps_ns: Stamps = self.laid.stamps_ns
+        stamps_ns: Stamps = self.decoded.stamps_ns
         if len(self.singles):
-            order = np.argsort(np.concatenate([self.laid.arrival, self.singles.arrival]), kind="stable")
+            order = np.argsort(np.concatenate([self.decoded.arrival, self.singles.arrival]), kind="stable")
             stamps_ns = np.concatenate([stamps_ns, self.singles.stamps_ns])[order]
         return stamps_ns if stamps_ns.all() else np.where(stamps_ns == 0, log_ns, stamps_ns)
 
     def restamped(self) -> TopicColumns:
         """Return the messages stamped by log time."""
-        laid = replace(self.laid, stamps_ns=self.laid.log_ns)
-        return replace(self, laid=laid, singles=replace(self.singles, is_restamped=True))
+        decoded = replace(self.decoded, stamps_ns=self.decoded.log_ns)
+        return replace(self, decoded=decoded, singles=replace(self.singles, is_restamped=True))
 
     def part(self, kept: Mask) -> TopicColumns:
         """Return the messages of a mask (N,), in the order of `arrivals`."""
         arrival = self.arrivals[0][kept]
-        laid, singles = (np.flatnonzero(np.isin(each.arrival, arrival)) for each in (self.laid, self.singles))
-        return replace(self, laid=self.laid.part(laid), singles=self.singles.part(singles))
+        decoded, singles = (np.flatnonzero(np.isin(part.arrival, arrival)) for part in (self.decoded, self.singles))
+        return replace(self, decoded=self.decoded.part(decoded), singles=self.singles.part(singles))
 
     def arriving(self, renumbered: Callable[[Stamps], Stamps]) -> TopicColumns:
         """Return the messages with renumbered arrivals."""
         return replace(
             self,
-            laid=replace(self.laid, arrival=renumbered(self.laid.arrival)),
+            decoded=replace(self.decoded, arrival=renumbered(self.decoded.arrival)),
             singles=replace(self.singles, arrival=renumbered(self.singles.arrival)),
         )
 
@@ -231,8 +243,9 @@ class Collector:
     """Collector of a topic's messages. expected: number of messages. parameters: for the type's validity rules."""
 
     def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
+        """Reserve the columns. expected: number of messages. parameters: for the validity rules of the message type."""
         self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
-        shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "beside": (beside_width(msgtype),)}
+        shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "extra": (extra_width(msgtype),)}
         self._laid = {name: GrowingRows(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
         self._world = ""
         self._heading_variance = math.nan
@@ -272,7 +285,7 @@ class Collector:
                 self._heading_variance = heading_variance(columns.orientation_covariance[0])
         else:
             velocity = kind.velocity(columns)
-            values, extra = _columns_of(velocity), beside_velocity(columns, self._msgtype)
+            values, extra = _columns_of(velocity), extra_values(columns, self._msgtype)
             extra = np.broadcast_to(extra, (n, extra.shape[1]))
             covariances = _covariances(kind, columns)
             broken = _broken(kind, columns, self._parameters)
@@ -296,31 +309,31 @@ class Collector:
     def _take_singly(self, part: Part) -> None:
         """Keep the bytes of messages that have no common layout."""
         data = list(part.data())
-        end = self._bytes + np.cumsum([len(each) for each in data], dtype=np.int64)
+        end = self._bytes + np.cumsum([len(message) for message in data], dtype=np.int64)
         self._bytes = int(end[-1])
         channel = np.full(len(data), self._channels.setdefault(part.channel, len(self._channels)))
         content = np.frombuffer(b"".join(data), dtype=np.uint8)
-        for column, each in zip(
+        for column, values in zip(
             self._singles.values(), (part.arrival, part.log_ns, channel, end, content), strict=True
         ):
-            column.add(each)
+            column.add(values)
 
     def columns(self) -> TopicColumns:
-        """Return all messages."""
-        laid = Laid(
+        """Return all collected messages, each part in order of arrival."""
+        decoded = DecodedRows(
             **{name: column.array() for name, column in self._laid.items()},
             world=self._world,
             heading_variance=self._heading_variance,
             frames=tuple(frame_name(name.decode("ascii")) for name in self._frames),
             distinct=np.concatenate([np.zeros((0, 3, 3)), *self._distinct]),
         )
-        if (laid.arrival[1:] < laid.arrival[:-1]).any():  # several layouts alternated
-            laid = laid.part(np.argsort(laid.arrival, kind="stable"))
+        if (decoded.arrival[1:] < decoded.arrival[:-1]).any():  # several layouts alternated
+            decoded = decoded.part(np.argsort(decoded.arrival, kind="stable"))
         arrival, log_ns, channel, end, content = (column.array() for column in self._singles.values())
         singles = Singles(arrival, log_ns, channel, end, content, tuple(self._channels), self._decoder)
         if (singles.arrival[1:] < singles.arrival[:-1]).any():
             singles = singles.part(np.argsort(singles.arrival, kind="stable"))
-        return TopicColumns(self._topic, self._msgtype, laid, singles)
+        return TopicColumns(self._topic, self._msgtype, decoded, singles)
 
 
 def _columns_of(vector: Any) -> Array:
@@ -328,12 +341,12 @@ def _columns_of(vector: Any) -> Array:
     return np.column_stack([vector.x, vector.y, vector.z]).astype(float, copy=False)
 
 
-def beside_width(msgtype: str) -> int:
+def extra_width(msgtype: str) -> int:
     """Return the number of additional values per velocity or IMU message."""
     return 10 if msgtype == ODOMETRY else 3
 
 
-def beside_velocity(message: Any, msgtype: str) -> Array:
+def extra_values(message: Any, msgtype: str) -> Array:
     """Return the angular velocity of a twist (rad/s), or the pose of an odometry.
 
     Returns
@@ -343,7 +356,7 @@ def beside_velocity(message: Any, msgtype: str) -> Array:
     """
     twist = getattr(message, "twist", None)
     if twist is None:
-        return np.full((1, beside_width(msgtype)), np.nan)
+        return np.full((1, extra_width(msgtype)), np.nan)
     rates = _columns_of(getattr(twist, "twist", twist).angular)
     if msgtype != ODOMETRY:
         return rates

@@ -123,9 +123,9 @@ def without_far(
     [is_log_far] = far([joined])
     log_masks = np.split(is_log_far, np.cumsum([len(stamps) for stamps in log_ns])[:-1]) if names else []
     # a topic that is far as a whole has another clock, which is detected and reported later
-    log_masks = [np.zeros_like(own) if len(own) >= FEWEST_OF_A_CLOCK and own.all() else own for own in log_masks]
+    log_masks = [np.zeros_like(mask) if len(mask) >= FEWEST_OF_A_CLOCK and mask.all() else mask for mask in log_masks]
     stamps_ns = [columns[name].stamps_ns for name in names]
-    log_masks = [own | wrong for own, wrong in zip(log_masks, logged_elsewhere(stamps_ns, log_ns), strict=True)]
+    log_masks = [mask | wrong for mask, wrong in zip(log_masks, logged_elsewhere(stamps_ns, log_ns), strict=True)]
     is_log_far = np.concatenate([is_log_far[:0], *log_masks])
     # messages with wrong log times may have stamps of the same clock: they do not count
     stamp_masks = far([stamps[~is_removed] for stamps, is_removed in zip(stamps_ns, log_masks, strict=True)])

@@ -30,11 +30,11 @@ from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, POSE_TYPE
 from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, recognised, suggested
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from ..verdict.reasons import Reason, finding
-from .columns import Collector, Laid, TopicColumns, is_kept
+from .columns import Collector, DecodedRows, TopicColumns, is_kept
 from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
-from .topic_preview import Survey, look_of
+from .topic_preview import Survey, preview_of
 from .topics import NONE, ORIENTATION, Topics, spelled
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
@@ -50,11 +50,18 @@ Span = tuple[int, int]
 class Recording:
     """One recording, or several as one.
 
-    types: topic -> message type. held: topic -> all its types. counts: topic -> number of messages. file_spans_ns: of
-    each file with a message. notes: messages to the user on damage. columns: of the topics that are kept, one part per
-    path. transforms: of tf_static. descriptions: of robot_description. parts: the recordings it was joined from, if
-    any. registrations: cached results of `register_as`. waters: its water properties. field_maps: topic of an unlisted
-    type -> field map for its likely velocity.
+    types: topic -> message type.
+    held: topic -> all its types.
+    counts: topic -> number of messages.
+    file_spans_ns: of each file with a message.
+    notes: messages to the user on damage.
+    columns: of the topics that are kept, one part per path.
+    transforms: of tf_static.
+    descriptions: of robot_description.
+    parts: the recordings it was joined from, if any.
+    registrations: cached results of `register_as`.
+    waters: its water properties.
+    field_maps: topic of an unlisted type -> field map for its likely velocity.
     """
 
     paths: tuple[Path, ...]
@@ -71,9 +78,9 @@ class Recording:
     waters: tuple[OfWater, ...] = ()
     field_maps: Mapping[str, str] = field(default_factory=dict)
 
-    def register_as(self, found: Registration, topics: Topics, parameters: Parameters) -> None:
+    def register_as(self, registration: Registration, topics: Topics, parameters: Parameters) -> None:
         """Cache a registration for these topics and parameters."""
-        self.registrations[self._registration_key(topics, parameters)] = found
+        self.registrations[self._registration_key(topics, parameters)] = registration
 
     def registration(self, topics: Topics, parameters: Parameters) -> Registration | None:
         """Return the cached registration for the same topics and parameters, or None."""
@@ -139,12 +146,12 @@ class Recording:
     def _surveyed(self, columns: Mapping[str, tuple[TopicColumns, ...]], *, whole: bool) -> Survey:
         """Return the previews of readable topics; of the others the reason why their first message cannot be read."""
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
-        looks = {
-            topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
-                           spans_ns, whole=whole)
+        previews = {
+            topic: preview_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic],
+                              start_ns, spans_ns, whole=whole)
             for topic, parts in columns.items()
         }  # fmt: skip
-        read = {topic: look for topic, look in looks.items() if look is not None}
+        read = {topic: preview for topic, preview in previews.items() if preview is not None}
         unread = {
             topic: reason
             for topic, parts in columns.items() if topic not in read
@@ -194,10 +201,12 @@ class Held:
     lacks_definition: bool
 
 
-def _joined(found: Sequence[Stretch]) -> Streams:
-    if not found:
+def _joined(stretches: Sequence[Stretch]) -> Streams:
+    if not stretches:
         return Streams(*map(no_samples, (Stream.DVL, Stream.REFERENCE, Stream.IMU)))
-    return Streams(*(one.joined(*others) for one, *others in zip(*(stretch.streams for stretch in found), strict=True)))
+    return Streams(
+        *(one.joined(*others) for one, *others in zip(*(stretch.streams for stretch in stretches), strict=True))
+    )
 
 
 def open_recording(
@@ -208,11 +217,12 @@ def open_recording(
 ) -> Recording:
     """Read recordings once, several as one in order of log time. Raises InputError for a path that is no bag.
 
-    topics: the only ones to keep; by default all useful ones. parameters: for messages' own validity rules (max_fom).
+    topics: the only ones to keep; by default all useful ones.
+    parameters: for messages' own validity rules (max_fom).
     on_progress: receives the share (0..1) read.
     """
     parameters = parameters or Parameters()
-    each = []
+    recordings = []
     with ExitStack() as stack:
         # a fault of the last bag is reported before reading the first
         bags = [stack.enter_context(open_bags([path], parameters.dvl_fields)) for path in paths]
@@ -221,43 +231,43 @@ def open_recording(
             def progress(share: float, index: int = index) -> None:
                 on_progress((index + share) / len(paths))
 
-            each.append(_read(path, bag, topics, parameters, progress))
-    return together(each)
+            recordings.append(_read(path, bag, topics, parameters, progress))
+    return together(recordings)
 
 
-def together(each: Sequence[Recording]) -> Recording:
-    """Join several recordings."""
-    if len(each) == 1:
-        return each[0]
+def together(recordings: Sequence[Recording]) -> Recording:
+    """Join several recordings to one; their arrivals are renumbered by log time."""
+    if len(recordings) == 1:
+        return recordings[0]
     counts: Counter[str] = Counter()
-    for one in each:
-        counts.update(one.counts)
-    names = dict.fromkeys(name for one in each for name in one.types)
-    held = {name: [one.held[name] for one in each if name in one.held] for name in names}
+    for recording in recordings:
+        counts.update(recording.counts)
+    names = dict.fromkeys(name for recording in recordings for name in recording.types)
+    held = {name: [recording.held[name] for recording in recordings if name in recording.held] for name in names}
     return Recording(
-        tuple(path for one in each for path in one.paths),
-        {name: kind for one in each for name, kind in one.types.items()},
+        tuple(path for recording in recordings for path in recording.paths),
+        {name: kind for recording in recordings for name, kind in recording.types.items()},
         {
             name: Held(frozenset().union(*(held.types for held in owns)), any(held.lacks_definition for held in owns))
             for name, owns in held.items()
             if owns
         },
         counts,
-        tuple(span for one in each for span in one.file_spans_ns),
-        tuple(note for one in each for note in one.notes),
-        _renumbered(each, names),
-        tuple(transform for one in each for transform in one.transforms),
-        tuple(dict.fromkeys(text for one in each for text in one.descriptions)),
-        tuple(each),
-        waters=_joined_waters(each),
-        field_maps={topic: text for one in each for topic, text in one.field_maps.items()},
+        tuple(span for recording in recordings for span in recording.file_spans_ns),
+        tuple(note for recording in recordings for note in recording.notes),
+        _renumbered(recordings, names),
+        tuple(transform for recording in recordings for transform in recording.transforms),
+        tuple(dict.fromkeys(text for recording in recordings for text in recording.descriptions)),
+        tuple(recordings),
+        waters=_joined_waters(recordings),
+        field_maps={topic: text for recording in recordings for topic, text in recording.field_maps.items()},
     )
 
 
-def _joined_waters(each: Sequence[Recording]) -> tuple[OfWater, ...]:
+def _joined_waters(recordings: Sequence[Recording]) -> tuple[OfWater, ...]:
     """Join the readings of the same topic."""
     found: dict[tuple[str, str], list[OfWater]] = {}
-    for reading in (reading for one in each for reading in one.waters):
+    for reading in (reading for recording in recordings for reading in recording.waters):
         found.setdefault((reading.topic, reading.kind), []).append(reading)
     return tuple(
         parts[0]._replace(values=np.concatenate([part.values for part in parts]), std=max(part.std for part in parts))
@@ -265,27 +275,29 @@ def _joined_waters(each: Sequence[Recording]) -> tuple[OfWater, ...]:
     )
 
 
-def _renumbered(each: Sequence[Recording], names: Collection[str]) -> dict[str, tuple[TopicColumns, ...]]:
+def _renumbered(recordings: Sequence[Recording], names: Collection[str]) -> dict[str, tuple[TopicColumns, ...]]:
     """Renumber the arrivals in all recordings by log time, and by recording at equal times."""
     arrivals, logs = [], []
-    for one in each:
-        found = [part.arrivals for parts in one.columns.values() for part in parts] or [_NOTHING]
-        arrival, log_ns = (np.concatenate(column) for column in zip(*found, strict=True))
+    for recording in recordings:
+        by_topic = [part.arrivals for parts in recording.columns.values() for part in parts] or [_NOTHING]
+        arrival, log_ns = (np.concatenate(column) for column in zip(*by_topic, strict=True))
         order = np.argsort(arrival, kind="stable")
         arrivals.append(arrival[order])
         logs.append(log_ns[order])
     new_arrival = np.empty(sum(map(len, logs)), dtype=np.int64)
     new_arrival[np.argsort(np.concatenate(logs), kind="stable")] = np.arange(len(new_arrival))
-    columns: dict[str, list[TopicColumns]] = {name: [] for name in names if any(name in one.columns for one in each)}
-    at = 0
-    for one, arrival in zip(each, arrivals, strict=True):
-        new_arrivals = new_arrival[at : at + len(arrival)]
-        at += len(arrival)
+    columns: dict[str, list[TopicColumns]] = {
+        name: [] for name in names if any(name in recording.columns for recording in recordings)
+    }
+    begin = 0
+    for recording, arrival in zip(recordings, arrivals, strict=True):
+        new_arrivals = new_arrival[begin : begin + len(arrival)]
+        begin += len(arrival)
 
         def renumbered(old_arrivals: Stamps, arrival: Stamps = arrival, new_arrivals: Stamps = new_arrivals) -> Stamps:
             return np.asarray(new_arrivals[np.searchsorted(arrival, old_arrivals)])
 
-        for name, parts in one.columns.items():
+        for name, parts in recording.columns.items():
             columns[name] += [part.arriving(renumbered) for part in parts]
     return {name: tuple(parts) for name, parts in columns.items()}
 
@@ -297,13 +309,13 @@ def _read(
     path: Path, bag: BagReader, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
 ) -> Recording:
     """Read a bag window by window: columns of moving topics, static transforms, descriptions, water readings."""
-    found = _Contents(bag, topics, parameters)
+    contents = _Contents(bag, topics, parameters)
     start_ns, end_ns = bag.span_ns
-    for window in windows(bag, found.topics, found.one_by_one):
+    for window in windows(bag, contents.topics, contents.one_by_one):
         for part in window.parts:
-            found.take(part)
+            contents.take(part)
         on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
-    columns = {topic: collector.columns() for topic, collector in found.sensors.items()}
+    columns = {topic: collector.columns() for topic, collector in contents.sensors.items()}
     for topic in _restamped(columns, parameters.restamp, path):
         columns[topic] = columns[topic].restamped()
     kept, file_spans_ns, far_findings = without_far(columns, bag.file_spans_ns)
@@ -317,8 +329,8 @@ def _read(
         (path,), types, held, counts, file_spans_ns,
         notes=(*bag.notes, *map(str, far_findings)),
         columns={topic: (column,) for topic, column in kept.items()},
-        transforms=tuple(found.transforms), descriptions=tuple(dict.fromkeys(found.descriptions)),
-        waters=tuple(reading for each in found.waters.values() for reading in each.readings()),
+        transforms=tuple(contents.transforms), descriptions=tuple(dict.fromkeys(contents.descriptions)),
+        waters=tuple(reading for water in contents.waters.values() for reading in water.readings()),
         field_maps=_field_maps(bag),
     )  # fmt: skip
 
@@ -326,8 +338,10 @@ def _read(
 class _Contents:
     """Contents of a bag read so far.
 
-    topics: to be read. one_by_one: those of them whose messages do not fit columns. sensors, waters: collectors by
-    topic. transforms, descriptions: from the static topics.
+    topics: to be read.
+    one_by_one: those of them whose messages do not fit columns.
+    sensors, waters: collectors by topic.
+    transforms, descriptions: from the static topics.
     """
 
     def __init__(self, bag: BagReader, topics: Topics | None, parameters: Parameters) -> None:
@@ -445,7 +459,7 @@ def _poses_as_imus(columns: Collection[TopicColumns]) -> list[TopicColumns]:
     """Return the orientations of all topics of poses as IMUs; none if a recorded IMU may have an orientation."""
     imus = [column for column in columns if column.msgtype == IMU_TYPE]
     # messages without columns (singles) are not looked into
-    if any(len(column.singles) or hold_orientations(column.laid.values) for column in imus):
+    if any(len(column.singles) or hold_orientations(column.decoded.values) for column in imus):
         return []
     return [imu for imu in map(orientations_of, columns) if imu is not None]
 
@@ -466,12 +480,12 @@ def orientations_of(poses: TopicColumns) -> TopicColumns | None:
     (arrival, log_ns), stamps_ns = poses.arrivals, poses.stamps_ns
     values[known, 4:] = _turn_rates(stamps_ns[known], values[known, :4])
     n = len(poses)
-    laid = Laid(
+    decoded = DecodedRows(
         arrival, log_ns, stamps_ns, values, np.zeros(n, dtype=np.int32), np.full(n, -1, dtype=np.int32),
         np.zeros(n, dtype=np.uint8), np.full((n, 3), np.nan), frames=("",),
     )  # fmt: skip
     no_singles = poses.singles.part(np.zeros(0, dtype=np.intp))
-    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, laid, no_singles)
+    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, decoded, no_singles)
 
 
 def hold_orientations(values: Array) -> bool:
@@ -502,7 +516,7 @@ def _turn_rates(stamps_ns: Stamps, quaternions: Array) -> Array:
     return rates
 
 
-def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> None:
+def check_topics(recording: Recording, topics: Topics, reasons: list[Reason]) -> None:
     """Raise InputError unless there is a readable DVL; other missing data are added to `found`."""
     present, where = recording.types, recording.where
     if not present:
@@ -513,11 +527,11 @@ def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> N
         listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
         option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
         raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
-    _check_types(recording, topics, found)
+    _check_types(recording, topics, reasons)
     if not recording.counts[topics.dvl]:
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
     if topics.gnss not in (*present, NONE):
-        found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
+        reasons.append(finding("BAG_NO_GNSS", topic=topics.gnss))
 
 
 def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | None) -> list[Reason]:
@@ -533,7 +547,7 @@ def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | Non
     return [finding("BAG_NO_IMU", what=what)]
 
 
-def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> None:
+def _check_types(recording: Recording, topics: Topics, reasons: list[Reason]) -> None:
     """Raise InputError for a topic of another or of several types; add missing definitions to `found`."""
     for role, wanted in _WANTED.items():
         name = getattr(topics, role)
@@ -547,7 +561,7 @@ def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> N
         if len(held.types) > 1:
             raise InputError(f"{recording.where}: topic {name} holds {types}; replay bags of one type together")
         if held.lacks_definition:
-            found.append(finding("BAG_NO_DEFINITION", type=types))
+            reasons.append(finding("BAG_NO_DEFINITION", type=types))
 
 
 _WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}

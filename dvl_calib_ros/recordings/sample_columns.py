@@ -25,7 +25,7 @@ from ..calibration.numerics.samples import (
     sample_block,
 )
 from ..messages.decode import AS_SENT, HALF_TURN, WRONG_FRAME, Axes, MessageDecoder, Refusal
-from .columns import Laid, TopicColumns
+from .columns import DecodedRows, TopicColumns
 
 # messages of a stretch: enough for columns to be efficient, few enough for the caches
 STRETCH_MESSAGES = 4096
@@ -61,12 +61,12 @@ def stretches(
     for index in range(len(ends)):
         if (len(ends) - 1 - index) * WINDOWS % len(ends) >= share * len(ends):
             continue
-        log_ns = max(each.newest_ns(index) for parts in cuts.values() for each in parts)
+        log_ns = max(part.newest_ns(index) for parts in cuts.values() for part in parts)
         dvl, reference, imu = (
             _block(
                 stream,
-                [laid for each in cuts[stream] if len(laid := each.laid(index))],
-                [each.singles(index) for each in cuts[stream]],
+                [decoded for cut in cuts[stream] if len(decoded := cut.decoded(index))],
+                [cut.singles(index) for cut in cuts[stream]],
                 decoder,
             )
             for stream in (Stream.DVL, Stream.REFERENCE, Stream.IMU)
@@ -80,43 +80,46 @@ class _Cut:
     def __init__(self, part: TopicColumns, ends: Sequence[int]) -> None:
         """Set up. ends: for each stretch, the first arrival after it."""
         self._part = part
-        self._laid = [0, *np.searchsorted(part.laid.arrival, ends).tolist()]
+        self._laid = [0, *np.searchsorted(part.decoded.arrival, ends).tolist()]
         self._singles = [0, *np.searchsorted(part.singles.arrival, ends).tolist()]
 
-    def laid(self, index: int) -> Laid:
-        return self._part.laid.part(slice(self._laid[index], self._laid[index + 1]))
+    def decoded(self, index: int) -> DecodedRows:
+        return self._part.decoded.part(slice(self._laid[index], self._laid[index + 1]))
 
     def singles(self, index: int) -> Iterator[Row]:
         return self._part.singles.messages(slice(self._singles[index], self._singles[index + 1]))
 
     def newest_ns(self, index: int) -> int:
         """Return the log time of the last message up to the end of this stretch; 0 without any."""
-        ends = (self._part.laid, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
-        return max(int(each.log_ns[end - 1]) if end else 0 for each, end in ends)
+        ends = (self._part.decoded, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
+        return max(int(messages.log_ns[end - 1]) if end else 0 for messages, end in ends)
 
 
 def _block(
-    stream: Stream, laid: Sequence[Laid], singles: Sequence[Iterator[Row]], decoder: MessageDecoder
+    stream: Stream, decoded: Sequence[DecodedRows], singles: Sequence[Iterator[Row]], decoder: MessageDecoder
 ) -> SampleBlock:
-    """Return the samples of one stream, in order of arrival."""
+    """Return the samples of one stream, in order of arrival.
+
+    decoded: messages of fixed layouts. singles: messages that are decoded individually.
+    """
+    judge: Callable[[str], object]
+    decode: Callable[[Any, int], Decoded]
+    judge, decode = {
+        Stream.DVL: (decoder.accepts_dvl_frame, decoder.dvl),
+        Stream.REFERENCE: (decoder.reference_frame, decoder.reference),
+        Stream.IMU: (decoder.note_imu_frame, decoder.imu),
+    }[stream]
     # a frame is judged at its first message: the DVL's first frame is the DVL's own
-    pending = deque(sorted(first for each in laid for first in _first_of_frames(each)))
-    judge: Callable[[str], object] = {
-        Stream.DVL: decoder.accepts_dvl_frame, Stream.REFERENCE: decoder.reference_frame,
-        Stream.IMU: decoder.note_imu_frame,
-    }[stream]  # fmt: skip
-    rows: list[tuple[int, Decoded]] = []
-    decode: Callable[[Any, int], Decoded] = {
-        Stream.DVL: decoder.dvl, Stream.REFERENCE: decoder.reference, Stream.IMU: decoder.imu
-    }[stream]  # fmt: skip
+    pending = deque(sorted(first for rows in decoded for first in _first_of_frames(rows)))
+    samples: list[tuple[int, Decoded]] = []
     for arrival, log_ns, message, why in heapq.merge(*singles, key=lambda row: row[0]):
         while pending and pending[0][0] < arrival:
             judge(pending.popleft()[1])
-        rows.append((arrival, decoder.undecodable(stream, why) if why else decode(message, log_ns)))
+        samples.append((arrival, decoder.undecodable(stream, why) if why else decode(message, log_ns)))
     for _, name in pending:
         judge(name)
     make = _imu if stream is Stream.IMU else _velocity
-    blocks = [make(stream, each, decoder) for each in laid] + ([_of_rows(stream, rows)] if rows else [])
+    blocks = [make(stream, rows, decoder) for rows in decoded] + ([_of_rows(stream, samples)] if samples else [])
     if not blocks:
         return no_samples(stream)
     if len(blocks) == 1:
@@ -125,51 +128,51 @@ def _block(
     return block.part(np.argsort(block.arrival, kind="stable"))
 
 
-def _first_of_frames(laid: Laid) -> list[tuple[int, str]]:
+def _first_of_frames(decoded: DecodedRows) -> list[tuple[int, str]]:
     """Return the arrival of the first message of each frame, and the frame's name."""
-    if (laid.frame == laid.frame[0]).all():
-        places = [int(laid.frame[0])]
+    if (decoded.frame == decoded.frame[0]).all():
+        places = [int(decoded.frame[0])]
     else:
-        places = np.flatnonzero(np.bincount(laid.frame)).tolist()
-    return [(int(laid.arrival[np.argmax(laid.frame == place)]), laid.frames[place]) for place in places]
+        places = np.flatnonzero(np.bincount(decoded.frame)).tolist()
+    return [(int(decoded.arrival[np.argmax(decoded.frame == place)]), decoded.frames[place]) for place in places]
 
 
-def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:
+def _velocity(stream: Stream, decoded: DecodedRows, decoder: MessageDecoder) -> SampleBlock:
     """Return the samples of DVL or reference, after all frames were judged."""
-    refused = np.zeros(len(laid), dtype=np.uint8)
+    refused = np.zeros(len(decoded), dtype=np.uint8)
     reasons: list[str] = []
-    frames = np.zeros(len(laid), dtype=np.uint8)
-    values, covariances = laid.values, laid.covariances
-    names = {place: laid.frames[place] for place in np.flatnonzero(np.bincount(laid.frame)).tolist()}
-    is_other = np.zeros(len(laid.frames), dtype=bool)
+    frames = np.zeros(len(decoded), dtype=np.uint8)
+    values, covariances = decoded.values, decoded.covariances
+    names = {place: decoded.frames[place] for place in np.flatnonzero(np.bincount(decoded.frame)).tolist()}
+    is_other = np.zeros(len(decoded.frames), dtype=bool)
     broken: list[tuple[str, Any]] = []
     if stream is Stream.DVL:
         for place, name in names.items():
             is_other[place] = name != decoder.dvl_frame
-        broken = [(rule.counter, laid.broken == code) for code, rule in enumerate(decoder.dvl_type.rules, start=1)]
+        broken = [(rule.counter, decoded.broken == code) for code, rule in enumerate(decoder.dvl_type.rules, start=1)]
     else:
-        codes = np.zeros(len(laid.frames), dtype=np.uint8)
+        codes = np.zeros(len(decoded.frames), dtype=np.uint8)
         axes: dict[Axes, Mask] = {}
         for place, name in names.items():
             declared = decoder.reference_frame(name)
             is_other[place] = declared is None
             codes[place] = 0 if declared is None else FRAME_CODES[declared.frame]
             if declared is not None and declared.axes is not AS_SENT:
-                axes.setdefault(declared.axes, np.zeros(len(laid.frames), dtype=bool))[place] = True
-        frames = codes[laid.frame]
+                axes.setdefault(declared.axes, np.zeros(len(decoded.frames), dtype=bool))[place] = True
+        frames = codes[decoded.frame]
         for frame_axes, of_frame in axes.items():
-            values, covariances = _turned(frame_axes, values, covariances, of_frame[laid.frame])
-    for reason, is_broken in [(WRONG_FRAME, is_other[laid.frame]), *broken]:
+            values, covariances = _turned(frame_axes, values, covariances, of_frame[decoded.frame])
+    for reason, is_broken in [(WRONG_FRAME, is_other[decoded.frame]), *broken]:
         new = is_broken & (refused == 0)
         if new.any():
             refused[new] = 1 + _index_of_reason(reasons, reason)
     if stream is Stream.DVL and not refused.all():
         decoder.note_axes()
         if decoder.turns_dvl:
-            values, covariances = _turned(HALF_TURN, values, covariances, np.ones(len(laid), dtype=bool))
+            values, covariances = _turned(HALF_TURN, values, covariances, np.ones(len(decoded), dtype=bool))
     return sample_block(
-        stream, _stamped(stream, laid, decoder, refused), values, covariance=covariances, frames=frames,
-        arrival=laid.arrival, refused=refused, reasons=reasons,
+        stream, _stamped(stream, decoded, decoder, refused), values, covariance=covariances, frames=frames,
+        arrival=decoded.arrival, refused=refused, reasons=reasons,
     )  # fmt: skip
 
 
@@ -184,20 +187,20 @@ def _turned(axes: Axes, values: Array, covariances: Covariances, which: Mask) ->
     return np.where(which[:, None], axes.velocity(values), values), Covariances(distinct, index.astype(np.intp))
 
 
-def _imu(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:
+def _imu(stream: Stream, decoded: DecodedRows, decoder: MessageDecoder) -> SampleBlock:
     """Return attitudes and angular velocities."""
-    refused = np.zeros(len(laid), dtype=np.uint8)
-    stamps_ns = _stamped(stream, laid, decoder, refused)
-    block = sample_block(stream, stamps_ns, laid.values, arrival=laid.arrival, refused=refused)
+    refused = np.zeros(len(decoded), dtype=np.uint8)
+    stamps_ns = _stamped(stream, decoded, decoder, refused)
+    block = sample_block(stream, stamps_ns, decoded.values, arrival=decoded.arrival, refused=refused)
     return decoder.imu_alignment.block(block)
 
 
-def _stamped(stream: Stream, laid: Laid, decoder: MessageDecoder, refused: Any) -> Stamps:
+def _stamped(stream: Stream, decoded: DecodedRows, decoder: MessageDecoder, refused: Any) -> Stamps:
     """Return stamps, with the log time for missing ones."""
-    is_zero = (laid.stamps_ns == 0) & (refused == 0)
+    is_zero = (decoded.stamps_ns == 0) & (refused == 0)
     if is_zero.any():
         decoder.note_zero_stamps(stream, int(np.count_nonzero(is_zero)))
-    return np.where(is_zero, laid.log_ns, laid.stamps_ns)
+    return np.where(is_zero, decoded.log_ns, decoded.stamps_ns)
 
 
 def _of_rows(stream: Stream, rows: list[tuple[int, Decoded]]) -> SampleBlock:

@@ -16,7 +16,7 @@ from ..calibration.streams.screening import NOT_MEASURED_VARIANCE, screen_column
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType
-from .columns import Laid, TopicColumns, stamped
+from .columns import DecodedRows, TopicColumns, stamped
 from .topic_preview import FASTEST
 
 # of an IMU
@@ -27,11 +27,15 @@ NOTHING = np.zeros((0, 3)), np.zeros(0, dtype=np.uint8)
 class Recorded:
     """N messages of a topic, in order of log time.
 
-    stamps_ns: (N,) of the header, 0 if missing. log_ns: (N,). values: (N, 3) m/s; of an IMU its quaternion (N, 4).
-    variances: (N, 3) (m/s)², nan if missing; (0, 3) of an IMU. unmeasured: (N,) codes of axes that a message marks as
-    not measured, see `screening.Screened`; (0,) of an IMU. refused: number of messages by counter of the driver's
-    rules. unreadable: number of unreadable messages. unreadable_because: reason of the first. window_s: averaging time
-    of velocities from positions, 0 for measured velocities.
+    stamps_ns: (N,) of the header, 0 if missing.
+    log_ns: (N,).
+    values: (N, 3) m/s; of an IMU its quaternion (N, 4).
+    variances: (N, 3) (m/s)², nan if missing; (0, 3) of an IMU.
+    unmeasured: (N,) codes of axes that a message marks as not measured, see `screening.Screened`; (0,) of an IMU.
+    refused: number of messages by counter of the driver's rules.
+    unreadable: number of unreadable messages.
+    unreadable_because: reason of the first.
+    window_s: averaging time of velocities from positions, 0 for measured velocities.
     """
 
     topic: str
@@ -65,9 +69,9 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     unread: list[str] = []
     rules = VELOCITY_TYPES[msgtype].rules if msgtype in VELOCITY_TYPES else ()
     for part in parts:
-        for code in np.flatnonzero(np.bincount(part.laid.broken)).tolist():
-            if code:
-                refused[rules[code - 1].counter] += int(np.count_nonzero(part.laid.broken == code))
+        for code in np.flatnonzero(np.bincount(part.decoded.broken)).tolist():
+            if code:  # 0: no rule is broken
+                refused[rules[code - 1].counter] += int(np.count_nonzero(part.decoded.broken == code))
     single_rows = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
     rows: list[_Row] = []
     position = VELOCITY_TYPES[msgtype].position if msgtype in VELOCITY_TYPES else None
@@ -86,10 +90,7 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
             refused.update(broken)
     is_imu = msgtype == IMU_TYPE
     width = 4 if is_imu else 3
-    columns = [
-        (each.arrival, each.log_ns, each.stamps_ns, each.values[:, :width], *(NOTHING if is_imu else _claimed(each)))
-        for each in (part.laid for part in parts)
-    ]
+    columns = [_of_decoded(part.decoded, width, is_imu) for part in parts]
     if rows or len(columns) > 1:
         columns.append(_of_rows(rows, width, is_imu))
     _, log_ns, stamps_ns, values, variances, unmeasured = columns[0] if len(columns) == 1 else _in_order(columns)
@@ -100,16 +101,17 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     )
 
 
-def _claimed(laid: Laid) -> tuple[Array, Codes]:
-    """Return variances (N, 3), and codes of axes marked as not measured (N,)."""
-    return laid.variances, screen_columns(laid.covariances).unmeasured
+def _of_decoded(rows: DecodedRows, width: int, is_imu: bool) -> tuple[Any, ...]:
+    """Return the columns of decoded messages, as `_of_rows`."""
+    claimed = NOTHING if is_imu else (rows.variances, screen_columns(rows.covariances).unmeasured)
+    return rows.arrival, rows.log_ns, rows.stamps_ns, rows.values[:, :width], *claimed
 
 
 def _in_order(columns: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
     """Join rows and sort them by arrival, the first column."""
-    joined = [np.concatenate(each) for each in zip(*columns, strict=True)]
+    joined = [np.concatenate(column_parts) for column_parts in zip(*columns, strict=True)]
     order = np.argsort(joined[0], kind="stable")
-    return tuple(each[order] if len(each) == len(order) else each for each in joined)
+    return tuple(column[order] if len(column) == len(order) else column for column in joined)
 
 
 def _plausible(values: Array, most: float) -> Array:
@@ -120,7 +122,10 @@ def _plausible(values: Array, most: float) -> Array:
 
 
 def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Parameters) -> tuple[_Row, list[str]]:
-    """Convert a message; return it with the counters of the rules that refuse it. Raises `UNREADABLE`."""
+    """Convert a message. Return its row, and the name of the validity rule that refuses it, if any.
+
+    Raises `UNREADABLE`.
+    """
     stamp = stamp_ns(message.header.stamp)
     if msgtype == IMU_TYPE:
         orientation = message.orientation
@@ -133,9 +138,9 @@ def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Para
     covariance = kind.covariance(message)
     if covariance is not None and not kind.lacks_covariance(message):
         flat = np.asarray(covariance, dtype=float).reshape(-1)
-        step = 4 if len(flat) == 9 else 7
-        if not (flat[[0, step, 2 * step]] <= 0.0).any():
-            variances = flat[[0, step, 2 * step]]
+        diagonal = flat[[0, 4, 8] if len(flat) == 9 else [0, 7, 14]]
+        if not (diagonal <= 0.0).any():
+            variances = diagonal
     broken = kind.broken_rule(message, parameters)
     return _Row(arrival, log_ns, stamp, (v.x, v.y, v.z), variances), [] if broken is None else [broken.counter]
 
@@ -165,7 +170,7 @@ def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType
 
 
 def _of_rows(rows: Sequence[_Row], width: int, is_imu: bool) -> tuple[Any, ...]:
-    """Convert decoded rows to columns: arrival, log time and stamp (N,), values (N, width), variances (N, 3)."""
+    """Return columns: arrival, log time and stamp (N,) ns, values (N, width), variances (N, 3), unmeasured (N,)."""
     times = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
     values = np.array([row.values for row in rows], dtype=float).reshape(-1, width)
     if is_imu:

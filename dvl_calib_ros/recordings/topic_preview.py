@@ -24,7 +24,7 @@ from ..calibration.streams.screening import NOT_MEASURED_VARIANCE
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType
-from .columns import ODOMETRY, TopicColumns, beside_velocity, stamped
+from .columns import ODOMETRY, TopicColumns, extra_values, stamped
 
 # Number, length and shortest sampling interval of the bursts. 24 bursts of 6 s contain turns and straights, and reveal
 # clock offsets of seconds; a DVL has at most 10 Hz.
@@ -39,17 +39,21 @@ FASTEST = 1e5
 
 
 @dataclass(frozen=True)
-class Look:
+class Preview:
     """N messages of one topic.
 
-    count: messages in the recording. rate_hz: average, 0 for a recording of an instant. frame_id: of the velocity or
-    the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header, or of the log
-    if zero. ahead_s: median of stamp minus log time; in simulated time, at its start. values: velocity (N, 3) m/s, as
-    in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan if missing.
-    rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero if missing. world: frame_id of
-    the header, which is the pose's frame for an odometry. claimed_std: median of the claimed noise per axis, m/s, or of
-    an IMU's heading, rad; nan if not claimed. clock_rate: seconds of stamps per second of log; 1 except in simulated
-    time. pose: (N, 7) position, m, and quaternion x y z w of an odometry.
+    count: messages in the recording.
+    rate_hz: average, 0 for a recording of an instant.
+    frame_id: of the velocity or the IMU's data, the first.
+    stamps_s: (N,) s since the first log time of the recordings, of the header, or of the log if zero.
+    ahead_s: median of stamp minus log time; in simulated time, at its start.
+    values: velocity (N, 3) m/s, as in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and
+      acceleration m/s², nan if missing.
+    rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero if missing.
+    world: frame_id of the header, which is the pose's frame for an odometry.
+    claimed_std: median of the claimed noise per axis, m/s, or of an IMU's heading, rad; nan if not claimed.
+    clock_rate: seconds of stamps per second of log; 1 except in simulated time.
+    pose: (N, 7) position, m, and quaternion x y z w of an odometry.
     """
 
     topic: str
@@ -91,44 +95,39 @@ class Survey:
 
     topics: Mapping[str, str]
     counts: Mapping[str, int]
-    looks: Mapping[str, Look]
+    previews: Mapping[str, Preview]
     transforms: tuple[Any, ...]
     descriptions: tuple[str, ...]
     unread: Mapping[str, str] = field(default_factory=dict)
     field_maps: Mapping[str, str] = field(default_factory=dict)
 
 
-def look_of(
+def preview_of(
     parts: Sequence[TopicColumns],
     count: int,
     start_ns: int,
     spans_ns: Sequence[tuple[int, int]],
     *,
     whole: bool = False,
-) -> Look | None:
+) -> Preview | None:
     """Return the preview of a topic, of which each recording has a part; None if no message can be read.
 
-    start_ns: first log time of the recordings. spans_ns: start and end of each recorded stretch, in order. whole: all
-    messages, up to MOST, instead of bursts.
+    start_ns: first log time of the recordings.
+    spans_ns: start and end of each recorded stretch, in order.
+    whole: all messages, up to MOST, instead of bursts.
     """
     topic, msgtype = parts[0].topic, parts[0].msgtype
     seconds = 1e-9 * sum(end - start for start, end in spans_ns)
     every_s = seconds / count if count else 0.0
     is_seldom = every_s > SELDOM_S and is_position(msgtype)
-    numbers = _Numbers(msgtype, every_s if is_seldom else 1.0)
+    rows = _PreviewRows(msgtype, every_s if is_seldom else 1.0)
     chosen = np.zeros(0, dtype=np.int64) if whole or is_seldom else in_bursts(parts, spans_ns)
     if not len(chosen):  # bursts may miss all messages if one wrong log time makes the recording long
         chosen = np.sort(np.concatenate([part.arrivals[0] for part in parts]))
         if not is_position(msgtype):  # positions are kept, because velocities are differences of successive ones
             chosen = chosen[:: -(-len(chosen) // MOST) or 1]
-    for part in parts:
-        numbers.add_columns(part, _places(part.laid.arrival, chosen))
-    singles = sorted(
-        (row for part in parts for row in part.singles.messages(_places(part.singles.arrival, chosen))),
-        key=lambda row: row[0],
-    )
-    numbers.add_messages([(arrival, log_ns, message) for arrival, log_ns, message, _ in singles if message is not None])
-    ordered = numbers.in_order()
+    rows.add_chosen(parts, chosen)
+    ordered = rows.in_order()
     if ordered is None:
         return None
     stamps_ns, log_ns, values, extra, kept = ordered
@@ -139,11 +138,10 @@ def look_of(
     rates, pose = extra[kept, :3], extra[kept, 3:] if msgtype == ODOMETRY else None
     if msgtype == IMU_TYPE:
         values, rates = np.hstack([values, extra]), np.full((0, 3), np.nan)
-    known_rates = None if np.isnan(rates).all() else rates
-    frame_id, claimed = numbers.frame_id, numbers.claimed_std
-    return Look(
-        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], known_rates, numbers.world, claimed,
-        clock_rate, pose,
+    return Preview(
+        topic, msgtype, count, rate_hz, rows.frame_id, stamps_s, ahead_s, values[kept],
+        rates=None if np.isnan(rates).all() else rates, world=rows.world, claimed_std=rows.claimed_std,
+        clock_rate=clock_rate, pose=pose,
     )  # fmt: skip
 
 
@@ -154,7 +152,7 @@ def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
     """
     if len(stamps_ns) < 2:
         return 1.0
-    stamped, logged = (float(median(np.diff(np.sort(each)).astype(float))) for each in (stamps_ns, log_ns))
+    stamped, logged = (float(median(np.diff(np.sort(times_ns)).astype(float))) for times_ns in (stamps_ns, log_ns))
     rates = (stamped / logged, float(np.ptp(stamps_ns) / np.ptp(log_ns))) if stamped > 0.0 and logged > 0.0 else (1.0,)
     return rates[-1] if min(abs(math.log(rate)) for rate in rates) > SIMULATED_TIME else 1.0
 
@@ -173,7 +171,7 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
     spans_ns: start and end of each recorded stretch, in order.
     """
     arrivals = [part.arrivals for part in parts]
-    arrival, log_ns = (np.concatenate(each) for each in zip(*arrivals, strict=True))
+    arrival, log_ns = (np.concatenate(column) for column in zip(*arrivals, strict=True))
     if len(parts) > 1:
         order = np.argsort(arrival, kind="stable")
         arrival, log_ns = arrival[order], log_ns[order]
@@ -201,11 +199,11 @@ def is_position(msgtype: str) -> bool:
     return kind is not None and kind.position is not None
 
 
-class _Numbers:
-    """Collector of a preview's numbers: arrival, log time, stamp and values of each message."""
+class _PreviewRows:
+    """Collector of a preview's rows: arrival, log time (ns), stamp (ns), values and extra values of each message."""
 
     def __init__(self, msgtype: str, window_s: float) -> None:
-        """Set up. window_s: averaging time of velocities from positions."""
+        """Start without rows. window_s: averaging time of velocities from positions."""
         self._msgtype, self._kind, self._window_s = msgtype, VELOCITY_TYPES.get(msgtype), window_s
         self._rows: list[tuple[Stamps, Stamps, Stamps, Array, Array]] = []
         self._names: list[tuple[int, str]] = []
@@ -215,41 +213,51 @@ class _Numbers:
     @property
     def claimed_std(self) -> float:
         """Median claimed noise per axis, m/s, of valid messages if any; nan if none is claimed."""
-        of_each = np.concatenate([*self._variances, np.zeros(0)])
-        given = of_each[np.isfinite(of_each) & (of_each > 0.0)]
-        measured = given[given < NOT_MEASURED_VARIANCE]
-        given = measured if len(measured) else given
-        return math.sqrt(float(median(given))) if len(given) else math.nan
+        variances = np.concatenate([*self._variances, np.zeros(0)])
+        claimed = variances[np.isfinite(variances) & (variances > 0.0)]
+        measured = claimed[claimed < NOT_MEASURED_VARIANCE]
+        claimed = measured if len(measured) else claimed
+        return math.sqrt(float(median(claimed))) if len(claimed) else math.nan
 
     @property
     def frame_id(self) -> str:
         """Frame of the first message that has one."""
         return min(self._names)[1] if self._names else ""
 
-    def add_columns(self, part: TopicColumns, at: Index) -> None:
-        """Add the rows of some indices."""
+    def add_chosen(self, parts: Sequence[TopicColumns], chosen: Stamps) -> None:
+        """Add the messages whose arrivals are chosen."""
+        for part in parts:
+            self._add_decoded(part, _places(part.decoded.arrival, chosen))
+        singles = [row for part in parts for row in part.singles.messages(_places(part.singles.arrival, chosen))]
+        singles.sort(key=lambda row: row[0])
+        self._add_messages(
+            [(arrival, log_ns, message) for arrival, log_ns, message, _ in singles if message is not None]
+        )
+
+    def _add_decoded(self, part: TopicColumns, at: Index) -> None:
+        """Add the decoded messages at some indices."""
         if not len(at):
             return
-        laid = part.laid.part(at)
-        stamps_ns = np.where(laid.stamps_ns == 0, laid.log_ns, laid.stamps_ns)
-        self._rows.append((laid.arrival, laid.log_ns, stamps_ns, laid.values, laid.beside))
-        self.world = self.world or laid.world
-        of_each = laid.variances.mean(axis=1) if self._kind is not None else np.array([laid.heading_variance])
-        self._variances.append(of_each)
+        decoded = part.decoded.part(at)
+        stamps_ns = np.where(decoded.stamps_ns == 0, decoded.log_ns, decoded.stamps_ns)
+        self._rows.append((decoded.arrival, decoded.log_ns, stamps_ns, decoded.values, decoded.extra))
+        self.world = self.world or decoded.world
+        is_velocity = self._kind is not None
+        self._variances.append(decoded.variances.mean(axis=1) if is_velocity else np.array([decoded.heading_variance]))
         # the first message with a frame suffices
         self._names += [
-            (int(arrival), part.laid.frames[place])
-            for arrival, place in zip(laid.arrival.tolist(), laid.frame.tolist(), strict=True)
-            if part.laid.frames[place]
+            (int(arrival), part.decoded.frames[place])
+            for arrival, place in zip(decoded.arrival.tolist(), decoded.frame.tolist(), strict=True)
+            if part.decoded.frames[place]
         ][:1]
 
-    def add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
-        """Add arrival, log time (ns) and message of each."""
+    def _add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
+        """Decode and add messages, each with its arrival and log time (ns)."""
         if self._kind is not None and self._kind.position is not None:
             messages = _differences(messages, self._kind.position, self._window_s)
         for arrival, log_ns, message in messages:
             with suppress(*UNREADABLE):
-                values, extra = self._of(message)
+                values, extra = self._values_of(message)
                 row = np.array([[arrival], [log_ns], [stamped(message, log_ns)]])
                 name = frame_name(str(message.header.frame_id if self._kind is None else self._kind.frame_id(message)))
                 self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), extra))
@@ -257,11 +265,11 @@ class _Numbers:
                 self._variances.append(np.array([self._claimed_variance(message)]))
                 self.world = self.world or frame_name(str(message.header.frame_id))
 
-    def _of(self, message: Any) -> tuple[list[float], Array]:
+    def _values_of(self, message: Any) -> tuple[list[float], Array]:
         """Return a velocity, or an IMU's quaternion and angular velocity; and the additional values."""
         if self._kind is not None:
             v = message.velocity if self._kind.position else self._kind.velocity(message)
-            return [v.x, v.y, v.z], beside_velocity(message, self._msgtype)
+            return [v.x, v.y, v.z], extra_values(message, self._msgtype)
         q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
         given = (
             ((q.x, q.y, q.z, q.w), message.orientation_covariance),
@@ -287,13 +295,13 @@ class _Numbers:
         """Return stamps, log times, values, additional values, and the indices of valid rows in order of stamps."""
         if not self._rows:
             return None
-        arrival, log_ns, stamps_ns, values, extra = (np.concatenate(each) for each in zip(*self._rows, strict=True))
+        arrival, log_ns, stamps_ns, values, extra = (np.concatenate(column) for column in zip(*self._rows, strict=True))
         whole = np.ones(len(values), dtype=bool)
         if self._msgtype != IMU_TYPE:
             values[(values == 0.0).all(axis=1)] = np.nan  # sent by drivers without a measurement
             whole = (np.abs(values) < FASTEST).all(axis=1)
-        for each in (values, extra[:, :3]):
-            each[~(np.abs(each) < FASTEST)] = np.nan  # so that squares are finite
+        for numbers in (values, extra[:, :3]):
+            numbers[~(np.abs(numbers) < FASTEST)] = np.nan  # so that squares are finite
         order = np.lexsort((arrival, stamps_ns))
         return stamps_ns, log_ns, values, extra, order[whole[order]]
 

@@ -26,4 +26,4 @@ class Topics:
 
 def spelled(name: str, present: Collection[str]) -> str | None:
     """Return a topic as spelled in a recording, with or without a leading slash; None if missing."""
-    return next((each for each in (name, f"/{name}", name.lstrip("/")) if each in present), None)
+    return next((spelling for spelling in (name, f"/{name}", name.lstrip("/")) if spelling in present), None)

@@ -87,13 +87,13 @@ def disturbed(
     acts_on: ActsOn,
 ) -> Array:
     """Apply the effects on a sensor's noise, in order, to samples (N, 3) m/s at `motion.time`."""
-    for each, seed in injections:
-        if isinstance(each.effect, NoiseEffect) and each.effect.acts_on is acts_on:
-            velocity = each.effect.disturb(velocity, motion, each.values, np.random.default_rng(seed))
+    for injection, seed in injections:
+        if isinstance(injection.effect, NoiseEffect) and injection.effect.acts_on is acts_on:
+            velocity = injection.effect.disturb(velocity, motion, injection.values, np.random.default_rng(seed))
     return velocity
 
 
-def injection_document(each: Injection) -> dict[str, object]:
+def injection_document(injection: Injection) -> dict[str, object]:
     """Return plain data as in the diagnosis' JSON; null means no limit."""
-    values = {name: value if math.isfinite(value) else None for name, value in each.values.items()}
-    return {"name": each.effect.name, "parameters": values}
+    values = {name: value if math.isfinite(value) else None for name, value in injection.values.items()}
+    return {"name": injection.effect.name, "parameters": values}

@@ -34,8 +34,10 @@ REMEMBERED_CONSTANTS = 30.0
 class MotionSample:
     """Motion of the vehicle at one time.
 
-    time: s since the beginning. velocity_body: (3,) m/s over ground of the reference point. rotation_enu_from_body: (3,
-    3). angular_velocity: (3,) rad/s, body frame, forward-left-up.
+    time: s since the beginning.
+    velocity_body: (3,) m/s over ground of the reference point.
+    rotation_enu_from_body: (3, 3).
+    angular_velocity: (3,) rad/s, body frame, forward-left-up.
     """
 
     time: float
@@ -52,13 +54,14 @@ class Follower:
     """
 
     def __init__(self, scenario: Scenario, start_ns: int = START_NS) -> None:
+        """Create the sensors and noise processes with the seeds of `simulate`. start_ns: stamp of time 0."""
         self._scenario = scenario
         self._late_ns = start_ns - START_NS
         seeds = Seeds.of(scenario)
         self._disturbances = [
-            (each.effect, each.effect.following(each.values, np.random.default_rng(seed)))
-            for each, seed in zip(scenario.effects, seeds.effects, strict=True)
-            if isinstance(each.effect, NoiseEffect)
+            (injection.effect, injection.effect.following(injection.values, np.random.default_rng(seed)))
+            for injection, seed in zip(scenario.effects, seeds.effects, strict=True)
+            if isinstance(injection.effect, NoiseEffect)
         ]
         makers: tuple[Callable[..., Any], ...] = (dvl_at, gnss_at, imu_at)
         rates = (scenario.dvl_rate, scenario.gnss_rate, scenario.imu_rate)
@@ -67,7 +70,7 @@ class Follower:
             for make, rate, seed in zip(makers, rates, (seeds.dvl, seeds.gnss, seeds.imu), strict=True)
             if rate
         ]
-        constants = (each.values.get("time_constant_s", 0.0) for each in scenario.effects)
+        constants = (effect.values.get("time_constant_s", 0.0) for effect in scenario.effects)
         self._memory_s = REMEMBERED_CONSTANTS * max(constants, default=0.0)
         self._window: deque[MotionSample] = deque()
         self._pending: list[tuple[int, int, Sample]] = []
@@ -102,10 +105,10 @@ class Follower:
             return
         window = list(self._window)
         motion = Motion(
-            np.array([each.time for each in window]),
-            np.array([each.velocity_body for each in window]),
-            np.array([each.rotation_enu_from_body for each in window]),
-            np.array([each.angular_velocity for each in window]),
+            np.array([sample.time for sample in window]),
+            np.array([sample.velocity_body for sample in window]),
+            np.array([sample.rotation_enu_from_body for sample in window]),
+            np.array([sample.angular_velocity for sample in window]),
         )
         world = world_of(self._scenario, motion, self._disturbed)
         for sensor, at in due:

@@ -125,16 +125,16 @@ def _read(recording: MotionSource) -> _Samples:
     first_ns = min(velocity_ns[0], attitude_ns[0])
     return _Samples(
         1e-9 * (velocity_ns - first_ns),
-        np.concatenate([each.values for each in references])[at],
-        np.concatenate([each.frames for each in references])[at],
+        np.concatenate([reference.values for reference in references])[at],
+        np.concatenate([reference.frames for reference in references])[at],
         1e-9 * (attitude_ns - first_ns),
-        unit_quaternions(np.concatenate([each.orientation for each in attitudes])[attitude_at]),
+        unit_quaternions(np.concatenate([attitude.orientation for attitude in attitudes])[attitude_at]),
     )
 
 
 def _last_of_each(blocks: Sequence[SampleBlock]) -> tuple[Stamps, Index]:
     """Return the unique stamps, in order, and the last row of each, counted over all blocks."""
-    stamps_ns = np.concatenate([each.stamps_ns for each in blocks])
+    stamps_ns = np.concatenate([block.stamps_ns for block in blocks])
     found, from_the_end = np.unique(stamps_ns[::-1], return_index=True)
     return found, len(stamps_ns) - 1 - from_the_end
 

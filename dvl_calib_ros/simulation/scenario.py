@@ -44,8 +44,11 @@ GNSS_PHASE_S = 0.037
 class Scenario:
     """Configuration of a simulated run. Rates in Hz, standard deviations in m/s, times in s from the start.
 
-    recording: a bag that gives the motion instead of a trajectory. seconds: None is 600, or all of the recording.
-    outages: (from, to) without GNSS. gnss_frame: BODY or ENU. effects: in addition to the errors.
+    recording: a bag that gives the motion instead of a trajectory.
+    seconds: None is 600, or all of the recording.
+    outages: (from, to) without GNSS.
+    gnss_frame: BODY or ENU.
+    effects: in addition to the errors.
     """
 
     trajectory: str = "box"
@@ -78,7 +81,9 @@ class Run:
 class World:
     """Common input of all sensors, from `world_of`.
 
-    motion: the known motion. input: the same for effects. disturbed: applies the noise effects to a sensor's samples.
+    motion: the known motion.
+    input: the same for effects.
+    disturbed: applies the noise effects to a sensor's samples.
     """
 
     motion: Motion
@@ -179,7 +184,7 @@ def truth_document(scenario: Scenario) -> dict[str, Any]:
     return document | {
         "phi_rad": phi.tolist(),
         "delta_k": delta_k.tolist(),
-        "effects": [injection_document(each) for each in scenario.effects],
+        "effects": [injection_document(effect) for effect in scenario.effects],
         "version": __version__,
     }
 

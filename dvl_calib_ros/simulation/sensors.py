@@ -27,8 +27,10 @@ AXES_FROM_BEAMS: Array = np.linalg.pinv(BEAMS)  # least squares
 class DvlErrors:
     """Errors of a DVL.
 
-    misalignment_rpy: (3,) rad, actual DVL in its nominal orientation, as a URDF origin. scale: (3,) per axis.
-    beam_bias: (4,) m/s. beam_std: m/s of white noise on each beam.
+    misalignment_rpy: (3,) rad, actual DVL in its nominal orientation, as a URDF origin.
+    scale: (3,) per axis.
+    beam_bias: (4,) m/s.
+    beam_std: m/s of white noise on each beam.
     """
 
     misalignment_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)

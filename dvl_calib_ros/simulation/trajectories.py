@@ -23,8 +23,10 @@ WAVE_ROLL, WAVE_PITCH = np.deg2rad(2.0), np.deg2rad(1.0)
 class Motion:
     """Motion of the vehicle at N times.
 
-    time: (N,) s from 0. velocity_body: (N, 3) m/s of the reference point over ground, forward-left-up.
-    rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame.
+    time: (N,) s from 0.
+    velocity_body: (N, 3) m/s of the reference point over ground, forward-left-up.
+    rotation_enu_from_body: (N, 3, 3).
+    angular_velocity: (N, 3) rad/s, body frame.
     """
 
     time: Array

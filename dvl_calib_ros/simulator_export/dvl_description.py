@@ -35,8 +35,9 @@ NOT_EXPLAINED = "not_explained"
 class Other:
     """A diagnosed effect without its own number in the description.
 
-    size: rms, m/s, of its effect; None if unknown. of_the_reference: it affects the reference or the attitude, not the
-    DVL. of_another_day: difference of a recording from the first one, which is described.
+    size: rms, m/s, of its effect; None if unknown.
+    of_the_reference: it affects the reference or the attitude, not the DVL.
+    of_another_day: difference of a recording from the first one, which is described.
     """
 
     name: str
@@ -50,11 +51,16 @@ class Other:
 class DvlDescription:
     """Description of a DVL: SI, forward-left-up.
 
-    mounting_rpy: (3,) rad, `dvl_link` in the body as a URDF origin, misalignment included. lever_arm: (3,) m, of the
-    DVL from the reference point, body frame. scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
-    noise_std: (3,) m/s, of its axes. rate_hz: None if unknown. speed: (3,) m/s, rms along its axes. others: other
-    effects. source: file of origin. ambiguous: sets of indistinguishable effects, of which the first is used. doubts:
-    warnings, in sentences.
+    mounting_rpy: (3,) rad, `dvl_link` in the body as a URDF origin, misalignment included.
+    lever_arm: (3,) m, of the DVL from the reference point, body frame.
+    scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
+    noise_std: (3,) m/s, of its axes.
+    rate_hz: None if unknown.
+    speed: (3,) m/s, rms along its axes.
+    others: other effects.
+    source: file of origin.
+    ambiguous: sets of indistinguishable effects, of which the first is used.
+    doubts: warnings, in sentences.
 
     Raises InputError for numbers that are not finite, or a rate or noise that is not positive.
     """
@@ -76,9 +82,9 @@ class DvlDescription:
         if not all(math.isfinite(value) for vector in vectors for value in vector):
             raise InputError(f"{self.source}: holds numbers that are not finite; diagnose again")
         if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
-            raise InputError(f"{self.source}: rate_hz is {self.rate_hz:g}, which cannot be; diagnose again")
+            raise InputError(f"{self.source}: rate_hz is {self.rate_hz:g}, which is impossible; diagnose again")
         if any(std < 0.0 for std in self.noise_std or ()):
-            raise InputError(f"{self.source}: a standard deviation is negative, which cannot be; diagnose again")
+            raise InputError(f"{self.source}: a standard deviation is negative, which is impossible; diagnose again")
 
 
 def load_description(path: Path, sample: int | None = None) -> DvlDescription:
@@ -136,7 +142,7 @@ def _finite(word: str) -> float:
 def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
     """Describe the DVL by the calibration and effects of a diagnosis."""
     dvl, sizes = document["dvl"], {name: float(size) for name, size in document["dvl"]["sizes_mps"].items()}
-    found = {each["name"]: _values(each["parameters"]) for each in document["effects"]}
+    found = {effect["name"]: _values(effect["parameters"]) for effect in document["effects"]}
     arm = found.get("lever_arm", {})
     bias = found.get("velocity_bias", {})
     phi, scale = (_values(document["calibration"][name]) for name in ("phi_rad", "delta_k"))
@@ -155,16 +161,16 @@ def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
         speed=_three(dvl["speed_mps"]),
         others=_others(document, found, sizes),
         ambiguous=tuple(
-            (each["name"], *each["equivalent_to"]) for each in document["effects"] if each.get("equivalent_to")
+            (effect["name"], *effect["equivalent_to"]) for effect in document["effects"] if effect.get("equivalent_to")
         ),
     )
 
 
 def _others(
-    document: Mapping[str, Any], found: Mapping[str, Mapping[str, float]], sizes: Mapping[str, float]
+    document: Mapping[str, Any], effects: Mapping[str, Mapping[str, float]], sizes: Mapping[str, float]
 ) -> tuple[Other, ...]:
     """Return effects and noise without number of their own in a description, with their sizes."""
-    systematic = {name: dict(values) for name, values in found.items() if name not in GIVEN_AS_NUMBERS}
+    systematic = {name: dict(values) for name, values in effects.items() if name not in GIVEN_AS_NUMBERS}
     dvl = document["dvl"]
     for name, parameter, before in (
         ("dvl_time_offset", "seconds", dvl["time_offset_s"]),
@@ -180,10 +186,10 @@ def _others(
     ]
     if document.get("verdict") == "unknown":
         others.append(Other(NOT_EXPLAINED, {}, float(document["gap"]["not_explained_mps"])))
-    noise = [Other(each["name"], _values(each["parameters"])) for each in document.get("noise", [])]
+    noise = [Other(entry["name"], _values(entry["parameters"])) for entry in document.get("noise", [])]
     return (
         *others,
-        *(Other(each.name, each.parameters, sizes.get(each.name), _is_of_reference(each.name)) for each in noise),
+        *(Other(entry.name, entry.parameters, sizes.get(entry.name), _is_of_reference(entry.name)) for entry in noise),
     )
 
 
@@ -194,7 +200,7 @@ def _is_of_reference(name: str) -> bool:
 
 def _values(parameters: Mapping[str, Any]) -> dict[str, float]:
     """Return the values of a diagnosis' parameters; null means no limit."""
-    values = {name: each["value"] for name, each in parameters.items()}
+    values = {name: parameter["value"] for name, parameter in parameters.items()}
     return {name: math.inf if value is None else float(value) for name, value in values.items()}
 
 

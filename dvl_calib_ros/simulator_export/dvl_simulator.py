@@ -52,9 +52,9 @@ def write(description: DvlDescription) -> Settings:
     beams = beams_of(description.noise_std, math.radians(BEAM_ANGLE_DEG))
     scale = mixed_scale(description)
     drawn = draws(SEED)
-    roll, pitch, yaw = (math.degrees(each) for each in description.mounting_rpy)
+    roll, pitch, yaw = (math.degrees(angle) for angle in description.mounting_rpy)
     body_from_dvl = rotation_from_rpy(description.mounting_rpy)
-    known: dict[str, Any] = {
+    configured: dict[str, Any] = {
         "sample_time": None if description.rate_hz is None else 1.0 / description.rate_hz,
         "seed": SEED,
         "use_constant_seed": True,
@@ -67,12 +67,12 @@ def write(description: DvlDescription) -> Settings:
     if any(description.velocity_bias):
         angle = beams.angle if beams else math.radians(BEAM_ANGLE_DEG)
         bias = directions(angle) @ np.array(description.velocity_bias) / drawn[1:]
-        known |= {
+        configured |= {
             "interval_initial_beam_bias": bias.tolist(),
             "beam_bias_noise_std": 0.0,
             "beam_bias_correlation_time": FOR_EVER_S,
         }
-    values, found, assumed = split(known, DEFAULTS)
+    values, from_vehicle, assumed = split(configured, DEFAULTS)
     assumed["model_enable_settings"] = "all true"
     document = {
         "dvl_simulator": {
@@ -81,10 +81,10 @@ def write(description: DvlDescription) -> Settings:
             "model_enable_settings": {f"enable_{name}": True for name in ENABLED},
         }
     }
-    above = "".join(f"# {line}\n" for line in comment(TITLE, description, found, assumed).splitlines())
+    above = "".join(f"# {line}\n" for line in comment(TITLE, description, from_vehicle, assumed).splitlines())
     return Settings(
         above + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120),
-        found,
+        from_vehicle,
         assumed,
         beams.axis_std if beams else None,
         scale,
@@ -112,7 +112,5 @@ def directions(angle: float) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 SIMULATOR = Simulator(
-    TITLE,
-    write,
-    "use it as the node's parameter file; its odometry must be of the reference point, forward-left-up",
+    TITLE, write, "use it as the node's parameter file; its odometry must be of the reference point, forward-left-up"
 )

@@ -31,16 +31,16 @@ DEFAULTS = {
 def write(description: DvlDescription) -> Settings:
     """Write the sensor. Its noise is per beam; velocities are solved from the beams by least squares."""
     beams = beams_of(description.noise_std, math.radians(TILT_DEG))
-    known = {
+    configured = {
         "pose": numbers((*description.lever_arm, *description.mounting_rpy)),
         "update_rate": description.rate_hz,
         "stddev": beams.std if beams else None,
         "tilt": math.degrees(beams.angle) if beams and beams.is_found else None,
     }
-    values, found, assumed = split(known, DEFAULTS)
+    values, from_vehicle, assumed = split(configured, DEFAULTS)
     ET.register_namespace("gz", GZ)
     root = ET.Element("sdf", version="1.9")
-    root.append(ET.Comment(comment(TITLE, description, found, assumed)))
+    root.append(ET.Comment(comment(TITLE, description, from_vehicle, assumed)))
     link = ET.SubElement(ET.SubElement(root, "model", name="vehicle"), "link", name="base_link")
     sensor = ET.SubElement(link, "sensor", {"name": "dvl", "type": "custom", f"{{{GZ}}}type": "dvl"})
     for name, text in (
@@ -63,7 +63,7 @@ def write(description: DvlDescription) -> Settings:
     for name in ("resolution", "maximum_range", "minimum_range"):
         ET.SubElement(dvl, name).text = repr(values[name])
     ET.SubElement(dvl, "reference_frame").text = values["reference_frame"]
-    return Settings(xml_text(root), found, assumed, beams.axis_std if beams else None)
+    return Settings(xml_text(root), from_vehicle, assumed, beams.axis_std if beams else None)
 
 
 SIMULATOR = Simulator(

@@ -24,14 +24,14 @@ DEFAULTS = {
 def write(description: DvlDescription) -> Settings:
     """Write the sensor. Its noise is per beam. Rotations are in degrees about fixed axes: roll, pitch, yaw."""
     beams = beams_of(description.noise_std, math.radians(ELEVATION_DEG))
-    known = {
+    configured = {
         "location": description.lever_arm,
         "rotation": [math.degrees(angle) for angle in description.mounting_rpy],
         "Hz": description.rate_hz,
         "VelSigma": beams.std if beams else None,
         "Elevation": math.degrees(beams.angle) if beams and beams.is_found else None,
     }
-    values, found, assumed = split(known, DEFAULTS)
+    values, from_vehicle, assumed = split(configured, DEFAULTS)
     configuration = {name: values[name] for name in DEFAULTS if name != "Hz"}
     sensor = {
         "sensor_type": "DVLSensor",
@@ -43,7 +43,7 @@ def write(description: DvlDescription) -> Settings:
     }
     return Settings(
         json.dumps(sensor, indent=2, allow_nan=False) + "\n",
-        found,
+        from_vehicle,
         assumed,
         beams.axis_std if beams else None,
         remarks=(

@@ -29,15 +29,15 @@ def write(description: DvlDescription) -> Settings:
     """Write the sensor. Bodies are forward-right-down; the sensor, whose beams look along -z, stays forward-left-up."""
     rotation = FLU_FROM_FRD @ rotation_from_rpy(description.mounting_rpy)
     std = None if description.noise_std is None else equal_std(description.noise_std)
-    known = {
+    configured = {
         "origin xyz": numbers(FLU_FROM_FRD @ np.array(description.lever_arm)),
         "origin rpy": numbers(rpy_from_rotation(rotation)),
         "rate": description.rate_hz,
         "velocity": std,
     }
-    values, found, assumed = split(known, DEFAULTS)
+    values, from_vehicle, assumed = split(configured, DEFAULTS)
     sensor = ET.Element("sensor", name="dvl", rate=repr(values["rate"]), type="dvl")
-    sensor.append(ET.Comment(comment(TITLE, description, found, assumed)))
+    sensor.append(ET.Comment(comment(TITLE, description, from_vehicle, assumed)))
     ET.SubElement(sensor, "specs", beam_angle=repr(values["beam_angle"]))
     noise = ("velocity", "velocity_percent", "altitude", "water_velocity", "water_velocity_percent")
     ET.SubElement(sensor, "noise", {name: repr(values[name]) for name in noise})
@@ -46,7 +46,7 @@ def write(description: DvlDescription) -> Settings:
     ET.SubElement(sensor, "link", name="base_link")
     return Settings(
         xml_text(sensor),
-        found,
+        from_vehicle,
         assumed,
         None if std is None else (std, std, std),
         remarks=("velocity_percent stays 0: its noise follows the signed velocity, and would decrease astern",),

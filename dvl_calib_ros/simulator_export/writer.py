@@ -32,9 +32,13 @@ class Missing:
 class Settings:
     """Output of a writer.
 
-    text: the file. found: settings by name from the description. defaults: the simulator's own ones. noise_std: (3,)
-    m/s of its axes with these settings; None at the default noise. scale: the common error of all axes. remarks: for
-    the user of the file. represented: effects in the file, `scale` or `velocity_bias`.
+    text: the file.
+    found: settings by name from the description.
+    defaults: the simulator's own ones.
+    noise_std: (3,) m/s of its axes with these settings; None at the default noise.
+    scale: the common error of all axes.
+    remarks: for the user of the file.
+    represented: effects in the file, `scale` or `velocity_bias`.
     """
 
     text: str
@@ -68,7 +72,7 @@ class Export:
 def export(name: str, simulator: Simulator, description: DvlDescription) -> Export:
     """Return the settings of a simulator for a DVL."""
     settings = simulator.write(description)
-    missing = sorted(_missing(simulator.title, settings, description), key=lambda each: -(each.error or 0.0))
+    missing = sorted(_missing(simulator.title, settings, description), key=lambda effect: -(effect.error or 0.0))
     ambiguous = tuple(
         f"the data could not distinguish {', '.join(names)}; {names[0]} is used" for names in description.ambiguous
     )
@@ -80,7 +84,7 @@ def export_document(export: Export, description: DvlDescription, version: str) -
     return {
         "simulator": export.simulator,
         "source": description.source,
-        "missing": [{"name": each.name, "says": each.says, "error_mps": each.error} for each in export.missing],
+        "missing": [{"name": effect.name, "says": effect.says, "error_mps": effect.error} for effect in export.missing],
         "found": dict(export.settings.found),
         "defaults": dict(export.settings.defaults),
         "remarks": list(export.remarks),
@@ -185,7 +189,7 @@ def equal_std(noise_std: tuple[float, float, float]) -> float:
 def tidy(value: Any) -> Any:
     """Round numbers to nine digits, more than any is known to, and remove -0.0."""
     if isinstance(value, list | tuple):
-        return [tidy(each) for each in value]
+        return [tidy(item) for item in value]
     return float(f"{value:.9g}") + 0.0 if isinstance(value, float) else value
 
 

@@ -34,10 +34,14 @@ DROPOUT_INTERVALS = 1.6
 class StreamFacts:
     """Properties of one recording's DVL messages, N in order of stamps.
 
-    steps: (N - 1,) s between stamps. latency: (N,) s from stamp to log time; empty if these are of different clocks.
-    values: (N, 3) m/s of valid messages, without zeros while moving. received: number of messages. missing, refused,
-    zero: number of events (runs) of missing messages, of messages marked invalid, of exact zeros while moving. lost:
-    number of samples in all of these. repeats: valid messages that repeat the previous velocity exactly.
+    steps: (N - 1,) s between stamps.
+    latency: (N,) s from stamp to log time; empty if these are of different clocks.
+    values: (N, 3) m/s of valid messages, without zeros while moving.
+    received: number of messages.
+    missing, refused, zero: number of events (runs) of missing messages, of messages marked invalid, of exact zeros
+      while moving.
+    lost: number of samples in all of these.
+    repeats: valid messages that repeat the previous velocity exactly.
     """
 
     steps: Array
@@ -121,7 +125,8 @@ class Log:
     """Diagnosis of one side.
 
     residuals: (N, 3) m/s per recording, recorded DVL velocity minus the fitted model's, DVL frame, at the DVL's stamps.
-    exact: the DVL has no noise of its own. copied: it has the noise of its reference.
+    exact: the DVL has no noise of its own.
+    copied: it has the noise of its reference.
     """
 
     diagnosis: Diagnosis
@@ -138,16 +143,14 @@ class Log:
 
 
 def read_log(
-    source: RecordedSide,
-    on_progress: Callable[[float], None] = lambda _: None,
-    with_series: bool = False,
+    source: RecordedSide, on_progress: Callable[[float], None] = lambda _: None, with_series: bool = False
 ) -> Log:
     """Read and diagnose one side. Raises InputError if it cannot be compared."""
     loaded = load_recordings(source.opened, source.parameters, source.topics)
-    facts = tuple(stream_facts(each, source.parameters, source.topics) for each in source.opened.each)
+    facts = tuple(stream_facts(part, source.parameters, source.topics) for part in source.opened.each)
     on_progress(0.5)
-    exact = all(float(np.linalg.norm(each.dvl.roughness)) < NOISE_FREE_MPS for each in loaded.recordings)
-    recordings = tuple(dithered(each) for each in loaded.recordings) if exact else loaded.recordings
+    exact = all(float(np.linalg.norm(recording.dvl.roughness)) < NOISE_FREE_MPS for recording in loaded.recordings)
+    recordings = tuple(dithered(recording) for recording in loaded.recordings) if exact else loaded.recordings
     diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, with_series=with_series)
     on_progress(1.0)
     residuals: tuple[Array, ...] = ()

@@ -32,7 +32,7 @@ from .effect_comparison import (
     compared_names,
     fitted,
     is_there,
-    lies,
+    location_of,
     p_alike,
     sizes,
     smallest_difference,
@@ -50,7 +50,7 @@ from .stream_comparison import BLOCK, FEWEST_BLOCKS, OUTLIER, Candidate, compare
 # of equal size on both sides, so the scatter between blocks accounts for any distribution of the noise.
 
 # smaller ratios of levels are irrelevant
-WORTH_TELLING = 1.15
+RELEVANT_RATIO = 1.15
 # limit of the tails in standard deviations, below outliers
 TAIL = 3.7
 # smallest share of samples with motion astern to estimate its noise
@@ -68,8 +68,9 @@ Slopes = dict[str, tuple[float, float]]
 class Scatter:
     """Noise samples of one recording. values: (N, 3) m/s, white if the DVL's noise is, of its standard deviation.
 
-    motion: at the samples. thin: step between independent samples. of_reference: m/s, upper limit of the reference's
-    part.
+    motion: at the samples.
+    thin: step between independent samples.
+    of_reference: m/s, upper limit of the reference's part.
     """
 
     values: Array
@@ -79,17 +80,17 @@ class Scatter:
 
 
 def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
-    """Compare all properties observable on both sides."""
+    """Compare the noise of both sides: level per axis, growth with motion, tails, colour."""
     found: list[Candidate | None] = []
     sides = [scatter(log) for log in (vehicle, simulator)]
     if all(sides) and not (vehicle.exact or simulator.exact):
         slopes = [slopes_of(side) for side in sides]
-        scaled = at_one_motion(sides, slopes)
-        found += [_level(scaled[0], scaled[1], axis) for axis in range(3)]
+        of_vehicle, of_simulator = at_one_motion(sides, slopes)
+        found += [_level(of_vehicle, of_simulator, axis) for axis in range(3)]
         found += _growth(slopes)
-        found += [_tails(scaled[0], scaled[1])]
+        found += [_tails(of_vehicle, of_simulator)]
     found.append(_colour(vehicle, simulator))
-    return [each for each in found if each is not None]
+    return [candidate for candidate in found if candidate is not None]
 
 
 def scatter(log: Log) -> list[Scatter]:
@@ -130,8 +131,8 @@ def _differences(
 def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:
     """Return the log standard deviation (B,) of one axis in blocks of equal size."""
     levels = []
-    for each in scattered:
-        values = each.values[:, axis]
+    for recorded in scattered:
+        values = recorded.values[:, axis]
         blocks = values[: len(values) // BLOCK * BLOCK].reshape(-1, BLOCK)
         levels.append(np.log(np.maximum(np.median(np.abs(blocks), axis=1) / norm.ppf(0.75), 1e-9)))
     return np.concatenate(levels)
@@ -142,13 +143,13 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     blocks = [block_levels(side, axis) for side in (vehicle, simulator)]
     if min(map(len, blocks)) < FEWEST_BLOCKS:
         return None
-    of_reference = [max(each.of_reference for each in side) for side in (vehicle, simulator)]
+    of_reference = [max(recorded.of_reference for recorded in side) for side in (vehicle, simulator)]
     intervals = []
     for levels, reference in zip(blocks, of_reference, strict=True):
-        value, low, high = np.exp(mean_of(levels))
+        value, low, high = np.exp(np.array(mean_of(levels)))
         intervals.append((float(value), float(np.sqrt(max(low**2 - reference**2, 0.0))), float(high)))
     larger = 0 if intervals[0][0] >= intervals[1][0] else 1
-    own_levels = [np.asarray(each) for each in blocks]
+    own_levels = [np.asarray(block) for block in blocks]
     if of_reference[larger] > 0.0:
         own_variance = np.exp(2.0 * own_levels[larger]) - of_reference[larger] ** 2
         own_levels[larger] = 0.5 * np.log(np.maximum(own_variance, 1e-12))
@@ -156,7 +157,7 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     note = "DVL and reference together" if max(of_reference) > 0.0 else ""
     return Candidate(
         f"level_{'xyz'[axis]}", "m/s", intervals[0], intervals[1], welch(own_levels[0], own_levels[1]),
-        matters=ratio > WORTH_TELLING, note=note,
+        matters=ratio > RELEVANT_RATIO, note=note,
     )  # fmt: skip
 
 
@@ -165,7 +166,7 @@ def levels_by_regime(log: Log) -> dict[str, float]:
     noise_samples = scatter(log)
     if not noise_samples or log.selection is None:
         return {}
-    values = np.concatenate([each.values for each in noise_samples])
+    values = np.concatenate([noise_sample.values for noise_sample in noise_samples])
     masks = {"all": np.ones(len(values), dtype=bool)}
     has_motion: Any = noise_samples  # per sample, `regimes` reads nothing but the motion
     masks |= regimes(log.selection.fitter.problem, has_motion, per_sample=True)
@@ -184,22 +185,13 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
     units = {"speed": "1/(m/s)", "turn_rate": "1/(rad/s)", "astern": "1/(m/s)"}
     found: list[Candidate | None] = []
     for name, unit in units.items():
-        if not all(name in each for each in slopes):
+        if not all(name in slope for slope in slopes):
             continue
-        (vehicle_slope, vehicle_std), (simulator_slope, simulator_std) = (each[name] for each in slopes)
-        is_present = tuple(_is_significant(each, name) for each in slopes)
+        (vehicle_slope, vehicle_std), (simulator_slope, simulator_std) = (slope[name] for slope in slopes)
+        vehicle, simulator = around(vehicle_slope, vehicle_std), around(simulator_slope, simulator_std)
+        is_present = _is_significant(slopes[0], name), _is_significant(slopes[1], name)
         p = float(2.0 * norm.sf(abs(vehicle_slope - simulator_slope) / np.hypot(vehicle_std, simulator_std)))
-        found.append(
-            Candidate(
-                f"growth_with_{name}",
-                unit,
-                around(vehicle_slope, vehicle_std),
-                around(simulator_slope, simulator_std),
-                p,
-                (is_present[0], is_present[1]),
-                matters=any(is_present),
-            )
-        )
+        found.append(Candidate(f"growth_with_{name}", unit, vehicle, simulator, p, is_present, any(is_present)))
     return found
 
 
@@ -210,19 +202,23 @@ def _is_significant(slopes: Slopes, name: str) -> bool:
 
 
 def at_one_motion(sides: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
-    """Scale the noise to a common motion of both sides, by the significant growth."""
-    columns = [[_covariates(each) for each in side] for side in sides]
-    names = [name for name in SPREAD if any(name in slope and _is_significant(slope, name) for slope in slopes)]
+    """Scale the noise of both sides to a common motion, by the significant growth of each side.
+
+    sides: noise of the recordings of vehicle and simulator. slopes: growth of both.
+    """
     scaled = [list(side) for side in sides]
-    for name in names:
-        if not all(name in each for side in columns for each in side):
+    for name in SPREAD:
+        grows = [name in slope and _is_significant(slope, name) for slope in slopes]
+        covariates = [[_covariates(recorded) for recorded in side] for side in sides]
+        if not any(grows) or not all(name in known for side in covariates for known in side):
             continue
-        mean = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
-        for side, slope, own_columns in zip(scaled, slopes, columns, strict=True):
-            if name in slope and _is_significant(slope, name):
-                for index, each in enumerate(side):
-                    quieter = np.exp(-slope[name][0] * (own_columns[index][name] - mean))
-                    side[index] = replace(each, values=each.values * quieter[:, None])
+        values = [[known[name] for known in side] for side in covariates]
+        common = float(np.mean([np.mean(np.concatenate(side)) for side in values]))
+        for side in (side for side in range(len(sides)) if grows[side]):
+            for index, value in enumerate(values[side]):
+                factor = np.exp(-slopes[side][name][0] * (value - common))
+                noise = scaled[side][index]
+                scaled[side][index] = replace(noise, values=noise.values * factor[:, None])
     return scaled
 
 
@@ -265,8 +261,8 @@ def _tails(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> Candidat
     counts = []
     for side in (vehicle, simulator):
         far = n = 0
-        for each in side:
-            size = np.abs(each.values[:: each.thin]) / robust_std(each.values)
+        for recorded in side:
+            size = np.abs(recorded.values[:: recorded.thin]) / robust_std(recorded.values)
             far += int(((size > TAIL) & (size < OUTLIER)).sum())
             n += size.size
         counts.append((far, n))
@@ -279,25 +275,24 @@ def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
     Only if it is significant on one side: the reference's noise, and its motion between samples, also contribute to
     these means and differ between the sides.
     """
-    findings = [_finding(log, "coloured_reference_noise") for log in (vehicle, simulator)]
-    findings = [each if each is not None and each.p < GROWS else None for each in findings]
-    if findings[0] is None and findings[1] is None:
+    of_vehicle, of_simulator = _colour_finding(vehicle), _colour_finding(simulator)
+    if of_vehicle is None and of_simulator is None:
         return None
-    slow = [_block_means(log) for log in (vehicle, simulator)]
-    if min(len(each) for each in slow) < 3 * FEWEST_BLOCKS:
+    vehicle_means, simulator_means = _block_means(vehicle), _block_means(simulator)
+    if min(len(vehicle_means), len(simulator_means)) < 3 * FEWEST_BLOCKS:
         return None
-    ratio = float(np.mean(slow[0] ** 2) / np.mean(slow[1] ** 2))
-    above = float(f_distribution.sf(ratio, len(slow[0]), len(slow[1])))
+    ratio = float(np.mean(vehicle_means**2) / np.mean(simulator_means**2))
+    above = float(f_distribution.sf(ratio, len(vehicle_means), len(simulator_means)))
     p = 2.0 * min(above, 1.0 - above)
-    values = [f.parameters["time_constant_s"] if f is not None else (0.0, 0.0, 0.0) for f in findings]
-    return Candidate(
-        "colour", "s", values[0], values[1], p,
-        (findings[0] is not None, findings[1] is not None), note="of DVL or reference",
-    )  # fmt: skip
+    times = [f.parameters["time_constant_s"] if f is not None else (0.0, 0.0, 0.0) for f in (of_vehicle, of_simulator)]
+    is_present = of_vehicle is not None, of_simulator is not None
+    return Candidate("colour", "s", times[0], times[1], p, is_present, note="of DVL or reference")
 
 
-def _finding(log: Log, name: str) -> NoiseFinding | None:
-    return next((each for each in log.diagnosis.noise if each.name == name), None)
+def _colour_finding(log: Log) -> NoiseFinding | None:
+    """Return the diagnosis's finding of slow noise, if it is significant."""
+    found = (entry for entry in log.diagnosis.noise if entry.name == "coloured_reference_noise" and entry.p < GROWS)
+    return next(found, None)
 
 
 def _block_means(log: Log) -> Array:
@@ -353,22 +348,23 @@ def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
     candidates = [*compare_noise(vehicle, simulator), *compare_streams(vehicle, simulator)]
     names = common_names(vehicle, simulator)
     compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names))
-    p = holm([*compared.p.values(), *(each.p for each in candidates)])
-    found = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
-    found += [compared.untested(name) for name in compared.names if name not in compared.p]
-    found.sort(key=lambda each: (ORDER.index(each.status), -each.adds_mps))
-    noise = [_noise(each, float(adjusted)) for each, adjusted in zip(candidates, p[len(compared.p) :], strict=True)]
-    noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
-    status = {each.name: each.status for each in found}
+    p = holm([*compared.p.values(), *(candidate.p for candidate in candidates)])
+    effects = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
+    effects += [compared.untested(name) for name in compared.names if name not in compared.p]
+    effects.sort(key=lambda effect: (ORDER.index(effect.status), -effect.adds_mps))
+    of_noise = p[len(compared.p) :].tolist()
+    noise = [_noise(candidate, adjusted) for candidate, adjusted in zip(candidates, of_noise, strict=True)]
+    noise.sort(key=lambda entry: (ORDER.index(entry.status), entry.p))
+    status = {effect.name: effect.status for effect in effects}
     compared_sizes = {name: (*compared.sizes[name], status[name]) for name in compared.p}
     own_effects = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
     shrunk = shrink(vehicle, simulator, models(compared_sizes, own_effects))
     levels = [levels_by_regime(log) for log in (vehicle, simulator)]
-    verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
+    verdict = _verdict(effects, noise, vehicle.diagnosis, simulator.diagnosis)
     return UnpairedComparison(
         verdict=verdict,
-        reasons=_reasons(verdict, found, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
-        effects=tuple(found),
+        reasons=_reasons(verdict, effects, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
+        effects=tuple(effects),
         noise=tuple(noise),
         levels={name: (level, levels[1][name]) for name, level in levels[0].items() if name in levels[1]},
         rungs=shrunk.rungs,
@@ -391,14 +387,14 @@ def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
         "shrunk": shrunk,
         "residuals": {"vehicle": vehicle.residuals, "simulator": simulator.residuals},
         "intervals": {
-            side: [each.dvl.interval for each in log.recordings]
+            side: [recording.dvl.interval for recording in log.recordings]
             for side, log in (("vehicle", vehicle), ("simulator", simulator))
         },
     }
 
 
 class _Compared:
-    """Union of the effects, fitted to both sides."""
+    """Effects found on either side, fitted to both, with the p-value of equal sizes."""
 
     def __init__(
         self,
@@ -407,23 +403,27 @@ class _Compared:
         renamed: tuple[Mapping[str, str], Mapping[str, str]],
         names: Sequence[str],
     ) -> None:
+        """Fit the effects of both sides. All pairs are (vehicle, simulator).
+
+        renamed: name of an effect in a side's diagnosis -> name under which both sides are compared.
+        names: effects to fit on both sides.
+        """
         self.names = names
         self._selections, self._logs, self._renamed = selections, logs, renamed
         self._fits = tuple(fitted(selection, names) for selection in selections)
-        per_side = [
-            sizes(selection, fit, list(own.values()))
-            for selection, fit, own in zip(selections, self._fits, renamed, strict=True)
+        vehicle, simulator = self._sizes_of_sides = [
+            sizes(selection, fit, list(side_names.values()))
+            for selection, fit, side_names in zip(selections, self._fits, renamed, strict=True)
         ]
-        self._per_side = per_side
         self.sizes: dict[str, tuple[Size, Size]] = {
-            name: (per_side[0][name], per_side[1][name])
+            name: (vehicle[name], simulator[name])
             for name in names
-            if all(name in side for side in per_side) and compared_names(*(side[name] for side in per_side))
+            if name in vehicle and name in simulator and compared_names(vehicle[name], simulator[name])
         }
         self.p = {name: p_alike(*both) for name, both in self.sizes.items()}
 
     def effect(self, name: str, p: float) -> ComparedEffect:
-        """Compare an effect that both sides can be tested for. p: adjusted."""
+        """Compare an effect that both sides can be tested for. p: corrected for multiple tests."""
         vehicle, simulator = self.sizes[name]
         is_present = is_there(vehicle, simulator), is_there(simulator, vehicle)
         status = _status(is_present, p < LEVEL)
@@ -439,14 +439,14 @@ class _Compared:
         side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not is_present[0] else 0
         trace = trace_of(self._selections[side], self._fits[side], self.sizes[name][side].effect)
         adds = float(np.sqrt((trace**2).sum(axis=1).mean()))
-        where = lies(self._selections[side], self._fits[side], trace)
+        where = location_of(self._selections[side], self._fits[side], trace)
         return ComparedEffect(
             name, status, self._equivalent(name), vehicle.intervals(), simulator.intervals(), p, adds, where, needs
         )
 
     def untested(self, name: str) -> ComparedEffect:
         """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
-        sizes = [side[name].intervals() if name in side else {} for side in self._per_side]
+        sizes = [side[name].intervals() if name in side else {} for side in self._sizes_of_sides]
         effect = EFFECTS[name]
         needs = f"no common part of it is observable in both logs: {effect.manoeuvre}"
         for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):
@@ -462,9 +462,9 @@ class _Compared:
         """Return the effects that either diagnosis cannot distinguish from this one."""
         others: list[str] = []
         for log, renamed in zip(self._logs, self._renamed, strict=True):
-            for each in log.diagnosis.effects:
-                if renamed[each.name] == name:
-                    others += [n for n in (each.name, *each.equivalent_to) if n != name]
+            for effect in log.diagnosis.effects:
+                if renamed[effect.name] == name:
+                    others += [n for n in (effect.name, *effect.equivalent_to) if n != name]
         return tuple(dict.fromkeys(others))
 
 
@@ -494,7 +494,7 @@ def _noise(candidate: Candidate, p: float) -> ComparedNoise:
 def _unobserved(diagnosis: Diagnosis) -> dict[str, str]:
     """Return effects unobservable on a side at relevant sizes -> the smallest detectable size, or the missing data."""
     found = {name: f"needs {needs}" for name, needs in diagnosis.untestable.items()}
-    named = {each.name for each in diagnosis.effects}
+    named = {effect.name for effect in diagnosis.effects}
     for name, least in diagnosis.minimum_detectable.items():
         typical = {spec.name: spec.typical for spec in EFFECTS[name].parameters}
         if name not in named and not any(size <= VISIBLE_TIMES_TYPICAL * typical[key] for key, size in least.items()):
@@ -506,12 +506,12 @@ def _verdict(
     effects: Sequence[ComparedEffect], noise: Sequence[ComparedNoise], vehicle: Diagnosis, simulator: Diagnosis
 ) -> SimulatorVerdict:
     """Return the verdict: effects weigh more than noise, and a difference more than missing excitation."""
-    if any(each.status.is_claim for each in effects):
+    if any(effect.status.is_claim for effect in effects):
         return SimulatorVerdict.DIFFERENT
-    if any(each.status.is_claim for each in noise):
+    if any(entry.status.is_claim for entry in noise):
         return SimulatorVerdict.ONLY_NOISE
     unsure = Explained.INSUFFICIENT_EXCITATION in (vehicle.verdict, simulator.verdict)
-    if unsure or any(each.status is ComparisonStatus.CANNOT_TELL for each in effects):
+    if unsure or any(effect.status is ComparisonStatus.CANNOT_TELL for effect in effects):
         return SimulatorVerdict.CANNOT_TELL
     return SimulatorVerdict.NO_DIFFERENCE
 
@@ -534,7 +534,7 @@ def _reasons(
     """Return the verdict's reasons, and the unexplained remainder."""
     reasons = []
     for status, code in CLAIMED.items():
-        named = [" or ".join((each.name, *each.equivalent_to)) for each in effects if each.status is status]
+        named = [" or ".join((effect.name, *effect.equivalent_to)) for effect in effects if effect.status is status]
         if named:
             reasons.append(finding(code, names=" and ".join(named)))
     if reasons:
@@ -543,7 +543,7 @@ def _reasons(
     else:
         is_open = verdict is SimulatorVerdict.CANNOT_TELL
         reasons.append(finding("SIMULATOR_NOT_SHOWN" if is_open else "SIMULATOR_ALIKE"))
-    if differing := [each.name for each in noise if each.status.is_claim]:
+    if differing := [entry.name for entry in noise if entry.status.is_claim]:
         reasons.append(finding("SIMULATOR_NOISE", names=", ".join(differing)))
     unknown = [side for side, d in (("vehicle", vehicle), ("simulator", simulator)) if d.verdict is Explained.UNKNOWN]
     if unknown:

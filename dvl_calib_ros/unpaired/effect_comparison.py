@@ -43,9 +43,10 @@ CALIBRATION, FEWEST_DOF = 6, 4
 class Size:
     """An effect's size on one side. values: (p,) its linear parameters, averaged over recordings if they differ.
 
-    stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p). dof: of that
-    covariance. found: the side's own diagnosis named it. recordings: names of those with their own size, none if they
-    share it.
+    stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p).
+    dof: of that covariance.
+    found: the side's own diagnosis named it.
+    recordings: names of those with their own size, none if they share it.
     """
 
     effect: Effect
@@ -106,9 +107,9 @@ def p_alike(vehicle: Size, simulator: Size) -> float:
     names = compared_names(vehicle, simulator)
     mean, covariance = simulator.mean
     n = len(vehicle.stacked)
-    each, design = np.kron(np.eye(n), vehicle.taking(names)), np.tile(simulator.taking(names), (n, 1))
-    difference = each @ vehicle.stacked.ravel() - design @ mean
-    covariance = each @ vehicle.covariance @ each.T + design @ covariance @ design.T
+    to_names, design = np.kron(np.eye(n), vehicle.taking(names)), np.tile(simulator.taking(names), (n, 1))
+    difference = to_names @ vehicle.stacked.ravel() - design @ mean
+    covariance = to_names @ vehicle.covariance @ to_names.T + design @ covariance @ design.T
     return _wald(difference, covariance, min(vehicle.dof, simulator.dof))
 
 
@@ -118,13 +119,13 @@ def _wald(values: Array, covariance: Array, dof: int) -> float:
     return float(f_distribution.sf(statistic, p, max(dof - p, 2)))
 
 
-def is_there(own: Size, other: Size) -> bool:
+def is_there(size: Size, against_size: Size) -> bool:
     """Return whether a side has an effect: found there, or significant and not small against the other side's."""
-    if own.found:
+    if size.found:
         return True
-    value, against = own.mean[0], other.mean[0]
+    value, against = size.mean[0], against_size.mean[0]
     worth_it = float(np.linalg.norm(value)) > WORTH_IT * float(np.linalg.norm(against))
-    return worth_it and own.p_absent() < THERE
+    return worth_it and size.p_absent() < THERE
 
 
 def smallest_difference(vehicle: Size, simulator: Size, n_claims: int) -> dict[str, float]:
@@ -140,7 +141,7 @@ def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str
 
     An effect that one side cannot distinguish from one found on the other side gets that name.
     """
-    equals = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
+    equals = [{effect.name: effect.equivalent_to for effect in log.diagnosis.effects} for log in (vehicle, simulator)]
     names: list[dict[str, str]] = [{name: name for name in side} for side in equals]
     for own, other_side in ((0, 1), (1, 0)):
         for name, equivalent in equals[own].items():
@@ -172,8 +173,8 @@ def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
     return fitter.fit(fit.hypothesis.with_effects(chosen, fit.n_recordings, start), fit.noise)
 
 
-def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
-    """Return every effect of a fit by name. found: compared names in the side's own diagnosis."""
+def sizes(selection: EffectSelection, fit: Fit, found_names: Sequence[str]) -> dict[str, Size]:
+    """Return every effect of a fit by name. found_names: effects named by the diagnosis of this side."""
     block = blocks_of(selection.fitter.problem)
     covariance = fit.covariance(block)
     dof = int(block.max()) + 1
@@ -189,19 +190,25 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
             continue
         stacked = vector[part].reshape(n_recordings, n_parameters)
         recordings = tuple(selection.fitter.problem.recordings[i].name for i in owners if i is not None)
-        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found, recordings)
+        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found_names, recordings)
     return result
 
 
 def trace_of(selection: EffectSelection, fit: Fit, effect: Effect) -> Array:
-    """Return (M, A) m/s that an effect adds, without the part absorbed by misalignment, scale and other effects."""
+    """Return the residual (M, A) m/s that an effect adds, without the part that other parameters can absorb.
+
+    M: bins of time. A: compared axes.
+    """
     others = [other for other in fit.effects if other is not effect]
     without = selection.fitter.fit(fit.hypothesis.with_effects(others, fit.n_recordings, {}), fit.noise, 4)
     return without.residual - fit.residual
 
 
-def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
-    """Return axis, regime and band with most of a trace (M, A); the regime by energy per time."""
+def location_of(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
+    """Return the axis, regime of motion and frequency band with most energy of a trace (M, A) m/s.
+
+    A regime is named by its energy per time, compared with the whole run.
+    """
     problem = selection.fitter.problem
     energy = trace**2
     total = max(float(energy.sum()), 1e-300)
@@ -216,14 +223,11 @@ def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
     nyquist = 0.5 / problem.interval
     power = (np.abs(np.fft.rfft(trace, axis=0)) ** 2).sum(axis=1)
     frequency = np.linspace(0.0, nyquist, len(power))
-    bands = [
-        (
-            low,
-            min(high, nyquist),
-            float(power[(frequency >= low) & (frequency < high)].sum() / max(power.sum(), 1e-300)),
-        )
-        for low, high in itertools.pairwise(BANDS_HZ)
-        if low < nyquist
-    ]
-    low, high, band_share = max(bands, key=lambda band: band[2])
-    return Lies(names[axis], float(energy[:, axis].sum()) / total, regime, share, (float(low), float(high)), band_share)
+    bands = [(low, high) for low, high in itertools.pairwise(BANDS_HZ) if low < nyquist]
+    powers = [power[(frequency >= low) & (frequency < high)].sum() for low, high in bands]
+    strongest = int(np.argmax(powers))
+    low, high = bands[strongest]
+    return Lies(
+        names[axis], float(energy[:, axis].sum()) / total, regime, share, (float(low), float(min(high, nyquist))),
+        float(powers[strongest] / max(power.sum(), 1e-300)),
+    )  # fmt: skip

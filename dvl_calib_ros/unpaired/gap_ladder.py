@@ -67,7 +67,7 @@ def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Se
     ]
     ladder = [SimulatedModel(AS_IT_IS, (), kept)]
     for effect in lacking:
-        others = {name: each for name, each in kept.items() if name != effect.name}
+        others = {name: effect_kept for name, effect_kept in kept.items() if name != effect.name}
         ladder.append(SimulatedModel(f"with {effect.name}", (effect,), others))
     if len(lacking) != 1 or set(vehicle) != set(lacking) or kept:
         ladder.append(SimulatedModel(ALL, tuple(vehicle), {}))
@@ -94,9 +94,10 @@ def _values(size: Size) -> Values:
 class Shrunk:
     """Result of the ladder.
 
-    rungs: of the ladder. floor: m/s, error of the last rung without the vehicle's error beyond its noise, white and
-    slow. errors: (F, 3) m/s held out, DVL frame, by name of the model, nan if unknown. time: (F,) s since the start of
-    the recording recording_of (F,).
+    rungs: of the ladder.
+    floor: m/s, error of the last rung without the vehicle's error beyond its noise, white and slow.
+    errors: (F, 3) m/s held out, DVL frame, by name of the model, nan if unknown.
+    time: (F,) s since the start of the recording recording_of (F,).
     """
 
     rungs: tuple[Rung, ...]
@@ -113,20 +114,23 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel]) -> Sh
         raise ValueError("nothing was fitted to the vehicle's recordings")
     rng = np.random.default_rng(0)
     problem = selection.fitter.problem
-    recorded = [each.dvl.values for each in problem.recordings]
-    time = np.concatenate([each.dvl.time for each in problem.recordings])
-    recording_of = np.repeat(np.arange(len(recorded), dtype=np.intp), [len(each) for each in recorded])
+    recorded = [recording.dvl.values for recording in problem.recordings]
+    time = np.concatenate([recording.dvl.time for recording in problem.recordings])
+    recording_of = np.repeat(np.arange(len(recorded), dtype=np.intp), [len(velocity) for velocity in recorded])
     windows: Array = np.floor(time / WINDOW_S) + 1e6 * recording_of
     full = _held_out(selection, ladder[-1])
     # a time shift or lag changes the reference's noise, which must not be counted twice
-    shifts = tuple(each for each in ladder[-1].added if _is_time_shift(each))
+    shifts = tuple(effect for effect in ladder[-1].added if _is_time_shift(effect))
     ideal = _held_out(selection, SimulatedModel("", shifts, {}))
     # the vehicle's residual includes its reference's noise; the simulator's reference is noise-free
     of_reference = _reference_noise(problem, selection.fit.hypothesis, rng)
-    drawn = [_random_noise(simulator.residuals, dvl, rng) + r[0] for dvl, r in zip(recorded, of_reference, strict=True)]
+    drawn = [
+        _random_noise(simulator.residuals, dvl, rng) + noise[0]
+        for dvl, noise in zip(recorded, of_reference, strict=True)
+    ]
     own_noise = [
-        turned_over(dvl - predicted, noise_spectrum(of_it, one.dvl.noise), rng)
-        for dvl, predicted, of_it, one in zip(recorded, full, of_reference, problem.recordings, strict=True)
+        turned_over(recording.dvl.values - predicted, noise_spectrum(noise, recording.dvl.noise), rng)
+        for recording, predicted, noise in zip(problem.recordings, full, of_reference, strict=True)
     ]
     all_recorded, all_ideal = np.concatenate(recorded), np.concatenate(ideal)
     recorded_errors = all_recorded - all_ideal
@@ -172,7 +176,7 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     fixed = frozenset(kept)
     bins = stretch_of(problem.time) % SETTINGS.folds
     sample_folds = [_fold_of(problem, index) for index in range(n)]
-    predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
+    predicted = [np.full_like(recording.dvl.values, np.nan) for recording in problem.recordings]
     # at shifted times the reference's noise is different, so it would count twice
     denoised = with_denoised_reference(problem)
     for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
@@ -207,7 +211,7 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
         for _ in range(SIMULATED)
     ]
     return [
-        np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(denoised, hypothesis, index)
+        np.stack([simulated(entry, hypothesis, index) for entry in noisy]) - simulated(denoised, hypothesis, index)
         for index in range(len(problem.recordings))
     ]
 

@@ -70,9 +70,11 @@ class Lies:
 class ComparedEffect:
     """One effect on both sides. equivalent_to: effects that the data cannot distinguish from it.
 
-    vehicle, simulator: parameters; empty if not observable on that side. p: of equal sizes, adjusted (Holm) over all
-    claims; nan if not tested. adds_mps: rms of its addition to the vehicle's DVL (or, if only in the simulator, to
-    that), without the part absorbed by misalignment and scale. needs: what would make it observable.
+    vehicle, simulator: parameters; empty if not observable on that side.
+    p: of equal sizes, adjusted (Holm) over all claims; nan if not tested.
+    adds_mps: rms of its addition to the vehicle's DVL (or, if only in the simulator, to that), without the part
+      absorbed by misalignment and scale.
+    needs: what would make it observable.
     """
 
     name: str
@@ -103,9 +105,10 @@ class ComparedNoise:
 class Rung:
     """One model of the vehicle's DVL. name: the original simulator, or the effects added to it.
 
-    error_mps: rms of recorded minus simulated without noise, with limited outliers, on held-out stretches. distance:
-    energy distance between windows of both, with noise, in units of their spread. null95: its 95 % quantile if both are
-    alike. p: its p-value.
+    error_mps: rms of recorded minus simulated without noise, with limited outliers, on held-out stretches.
+    distance: energy distance between windows of both, with noise, in units of their spread.
+    null95: its 95 % quantile if both are alike.
+    p: its p-value.
     """
 
     name: str
@@ -119,9 +122,12 @@ class Rung:
 class UnpairedComparison(Answering):
     """Result of a comparison of a simulator with a vehicle.
 
-    reasons: the verdict first. effects: claims first, the largest first. noise: likewise, the most significant first.
-    levels: by regime, m/s RMS over the axes of vehicle and simulator. floor_mps: noise in `rungs` that no simulator can
-    remove. not_shown: per side, effects not observable at relevant sizes, with their smallest detectable size.
+    reasons: the verdict first.
+    effects: claims first, the largest first.
+    noise: likewise, the most significant first.
+    levels: by regime, m/s RMS over the axes of vehicle and simulator.
+    floor_mps: noise in `rungs` that no simulator can remove.
+    not_shown: per side, effects not observable at relevant sizes, with their smallest detectable size.
     """
 
     verdict: SimulatorVerdict
@@ -145,7 +151,7 @@ class UnpairedComparison(Answering):
     @property
     def missing(self) -> tuple[ComparedEffect, ...]:
         """Return the vehicle's effects that the simulator lacks, the largest first."""
-        return tuple(each for each in self.effects if each.status is ComparisonStatus.MISSING)
+        return tuple(effect for effect in self.effects if effect.status is ComparisonStatus.MISSING)
 
 
 def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
@@ -154,13 +160,13 @@ def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
         "verdict": comparison.verdict.value,
         "sentence": comparison.sentence,
         "reasons": [reason.as_dict() for reason in comparison.reasons],
-        "effects": [_row(each, p="p_adjusted", lies="where") for each in comparison.effects],
-        "noise": [_row(each, p="p_adjusted") for each in comparison.noise],
+        "effects": [_row(effect, p="p_adjusted", lies="where") for effect in comparison.effects],
+        "noise": [_row(entry, p="p_adjusted") for entry in comparison.noise],
         "noise_level_mps": {
             regime: {"vehicle": vehicle, "simulator": simulator}
             for regime, (vehicle, simulator) in comparison.levels.items()
         },
-        "shrinks": [_row(each, name="model", distance="energy_distance") for each in comparison.rungs],
+        "shrinks": [_row(rung, name="model", distance="energy_distance") for rung in comparison.rungs],
         "noise_floor_mps": comparison.floor_mps,
         "not_shown": {side: dict(names) for side, names in comparison.not_shown.items()},
         "notes": list(comparison.notes),
@@ -181,7 +187,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Lies):
         return _row(value)
     if isinstance(value, Mapping):
-        return {name: _plain(each) for name, each in value.items()}
+        return {name: _plain(item) for name, item in value.items()}
     if not isinstance(value, tuple):
         return value
     if len(value) != 3 or isinstance(value[0], str):

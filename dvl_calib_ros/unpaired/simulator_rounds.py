@@ -60,13 +60,13 @@ class Round:
     @property
     def effects(self) -> tuple[str, ...]:
         """Return the effects of the simulated DVL."""
-        return () if self.dvl is None else tuple(each["name"] for each in self.dvl["effects"])
+        return () if self.dvl is None else tuple(effect["name"] for effect in self.dvl["effects"])
 
     @property
     def claims(self) -> tuple[str, ...]:
         """Return the effects and noise properties that differ from the vehicle's."""
-        effects = [each.name for each in self.comparison.effects if each.status.is_claim]
-        return (*effects, *(each.name for each in self.comparison.noise if each.status.is_claim))
+        effects = [effect.name for effect in self.comparison.effects if effect.status.is_claim]
+        return (*effects, *(entry.name for entry in self.comparison.noise if entry.status.is_claim))
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,8 +103,8 @@ class ClosedGap(Answering):
         if self.best == 0:
             outcome = finding("SIMULATOR_ROUNDS_IN_VAIN", before=before, floor=floor)
         found = tuple(each for each in first.comparison.reasons if each.code in (*CLAIMED.values(), "SIMULATOR_FRAME"))
-        remaining = tuple(each for each in best.comparison.reasons if each.code in REMAINING)
-        names = ", ".join(each.name for each in best.comparison.effects if each.status.is_claim)
+        remaining = tuple(reason for reason in best.comparison.reasons if reason.code in REMAINING)
+        names = ", ".join(effect.name for effect in best.comparison.effects if effect.status.is_claim)
         not_added = (finding("SIMULATOR_NOT_ADDED", names=names),) if names and self.best else ()
         return (outcome, *found, *not_added, *remaining)
 
@@ -134,33 +134,33 @@ def close_gap(
         If the sides cannot be compared, or the simulator's log has no attitude and so no motion.
     """
     topics = simulator.topics.found_in(simulator.opened.types)
-    for path, one in zip(simulator.opened.paths, simulator.opened.each, strict=True):
-        if topics.imu not in one.types:
+    for path, recording in zip(simulator.opened.paths, simulator.opened.each, strict=True):
+        if topics.imu not in recording.types:
             raise InputError(
                 f"{path}: no attitude on {topics.imu}, so rounds have no motion to simulate on; record sensor_msgs/Imu "
                 "in the simulator, or compare without rounds"
             )
     steps = 2 + rounds
 
-    def part(number: int) -> Callable[[float], None]:
+    def share_of_step(number: int) -> Callable[[float], None]:
         return lambda share: on_progress((number + share) / steps)
 
-    real = read_log(vehicle, part(0))
-    as_recorded = compare_logs(real, read_log(simulator, part(1)))
-    found = [Round(replace(as_recorded, reasons=(*as_recorded.reasons, *other_frame(vehicle, simulator))))]
+    real = read_log(vehicle, share_of_step(0))
+    as_recorded = compare_logs(real, read_log(simulator, share_of_step(1)))
+    compared = [Round(replace(as_recorded, reasons=(*as_recorded.reasons, *other_frame(vehicle, simulator))))]
     document = None if real.diagnosis.dvl is None else diagnosis_document(real.diagnosis)
-    while document is not None and found[-1].claims and len(found) <= rounds:
-        if len(found) > 1:
-            corrected = corrected_document(document, found[-1].comparison)
+    while document is not None and compared[-1].claims and len(compared) <= rounds:
+        if len(compared) > 1:
+            corrected = corrected_document(document, compared[-1].comparison)
             if corrected == document:
                 break
             document = corrected
-        simulated = _simulated(document, len(found), simulator, folder, real.diagnosis)
-        log = read_log(simulated, part(1 + len(found)))
-        log = replace(log, facts=tuple(replace(each, latency=np.zeros(0)) for each in log.facts))  # no real log times
-        found.append(Round(compare_logs(real, log), document))
+        simulated = _simulated(document, len(compared), simulator, folder, real.diagnosis)
+        log = read_log(simulated, share_of_step(1 + len(compared)))
+        log = replace(log, facts=tuple(replace(fact, latency=np.zeros(0)) for fact in log.facts))  # no real log times
+        compared.append(Round(compare_logs(real, log), document))
     on_progress(1.0)
-    return ClosedGap(tuple(found))
+    return ClosedGap(tuple(compared))
 
 
 def check_rounds(rounds: int | None, keep: Path | None) -> None:
@@ -200,8 +200,8 @@ def against(
 def corrected_document(document: Mapping[str, Any], comparison: UnpairedComparison) -> dict[str, Any]:
     """Return a DVL's document corrected by the differences in effects, noise and rate."""
     corrected: dict[str, Any] = deepcopy(dict(document))
-    by_name = {each["name"]: each for each in corrected["effects"]}
-    for compared in (each for each in comparison.effects if each.status.is_claim):
+    by_name = {effect["name"]: effect for effect in corrected["effects"]}
+    for compared in (effect for effect in comparison.effects if effect.status.is_claim):
         effect = EFFECTS[compared.name]
         if not is_of_every_run(effect) or any(" of " in key for key in compared.vehicle):
             continue  # differs per recording, or happens at a time of a run that the simulator's may not have
@@ -216,7 +216,7 @@ def corrected_document(document: Mapping[str, Any], comparison: UnpairedComparis
             value = at["value"] + difference
             entry["parameters"][spec.name] = {"value": min(max(value, spec.low), spec.high)}
     dvl = corrected["dvl"]
-    differ = {each.name: each for each in comparison.noise if each.status.is_claim}
+    differ = {entry.name: entry for entry in comparison.noise if entry.status.is_claim}
     if "rate" in differ:
         dvl["rate_hz"] = differ["rate"].vehicle[0]
     levels = {axis: differ[name] for axis, name in enumerate(("level_x", "level_y", "level_z")) if name in differ}
@@ -268,16 +268,16 @@ def _simulated(
 def closed_gap_document(closed: ClosedGap) -> dict[str, Any]:
     """Return the JSON of `diagnose --simulator --rounds --json`: comparison and DVL of each round."""
     return {
-        "sentence": " ".join(each.full_sentence for each in closed.reasons),
-        "reasons": [each.as_dict() for each in closed.reasons],
+        "sentence": " ".join(reason.full_sentence for reason in closed.reasons),
+        "reasons": [reason.as_dict() for reason in closed.reasons],
         "best": closed.best,
         "rounds": [
             {
-                "error_mps": each.error_mps,
-                "differs_in": list(each.claims),
-                "dvl": each.dvl,
-                "comparison": unpaired_document(each.comparison),
+                "error_mps": one_round.error_mps,
+                "differs_in": list(one_round.claims),
+                "dvl": one_round.dvl,
+                "comparison": unpaired_document(one_round.comparison),
             }
-            for each in closed.rounds
+            for one_round in closed.rounds
         ],
     }

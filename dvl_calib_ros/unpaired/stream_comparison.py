@@ -23,7 +23,9 @@ BLOCK, FEWEST_BLOCKS = 40, 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """A property on both sides with the unadjusted p of equality.
+    """A noise property of both sides, and the p-value of equality before correction for multiple tests.
+
+    vehicle, simulator: value and ends of its 95 per cent interval, in `unit`.
 
     there: whether vehicle and simulator have it; true for a level. matters: whether the difference is large enough to
     be claimed.
@@ -39,15 +41,15 @@ class Candidate:
     note: str = ""
 
 
-def mean_of(values: Array) -> Array:
-    """Return the mean and its 95 per cent interval (3,)."""
+def mean_of(values: Array) -> Triple:
+    """Return the mean of values (N,) and the ends of its 95 per cent interval."""
     reach = t.ppf(0.975, max(len(values) - 1, 1)) * float(values.std(ddof=1)) / np.sqrt(len(values))
-    return np.array([values.mean(), values.mean() - reach, values.mean() + reach])
+    return float(values.mean()), float(values.mean() - reach), float(values.mean() + reach)
 
 
 def welch(one: Array, other: Array) -> float:
     """Return the p-value of equal means of two samples with any scatter."""
-    a, b = (float(each.var(ddof=1)) / len(each) for each in (one, other))
+    a, b = (float(values.var(ddof=1)) / len(values) for values in (one, other))
     if a + b <= 0.0:
         return 1.0 if one.mean() == other.mean() else 0.0
     dof = (a + b) ** 2 / (a**2 / (len(one) - 1) + b**2 / (len(other) - 1))
@@ -55,17 +57,17 @@ def welch(one: Array, other: Array) -> float:
 
 
 def shares_of(name: str, vehicle: tuple[int, int], simulator: tuple[int, int]) -> Candidate | None:
-    """Compare numbers of events among samples on both sides."""
-    if not vehicle[1] or not simulator[1] or vehicle[0] + simulator[0] == 0:
+    """Compare the shares of events of two sides, each given as (number of events, number of samples)."""
+    (vehicle_events, vehicle_samples), (simulator_events, simulator_samples) = vehicle, simulator
+    if not vehicle_samples or not simulator_samples or vehicle_events + simulator_events == 0:
         return None
-    table = [[k, max(n - k, 0)] for k, n in (vehicle, simulator)]
-    p = float(fisher_exact(table)[1])
-    shares = [_share(*counts) for counts in (vehicle, simulator)]
+    p = float(fisher_exact([[events, max(samples - events, 0)] for events, samples in (vehicle, simulator)])[1])
     # one or two events are not systematic
-    return Candidate(name, "share", shares[0], shares[1], p, (vehicle[0] > 2, simulator[0] > 2))
+    return Candidate(name, "share", _share(*vehicle), _share(*simulator), p, (vehicle_events > 2, simulator_events > 2))
 
 
 def _share(count: int, n: int) -> Triple:
+    """Return the share of `count` in `n` and the ends of its 95 per cent interval."""
     value = count / n
     half = 1.96 * np.sqrt(max(value * (1.0 - value), 0.25 / n) / n)
     return value, max(0.0, value - half), min(1.0, value + half)
@@ -81,7 +83,7 @@ def compare_streams(vehicle: Log, simulator: Log) -> list[Candidate]:
     """Compare all properties observable on both sides."""
     functions = (_exact, _outliers, _dropouts, _zeros, _repeats, _rate, _jitter, _latency)
     found = [function(vehicle, simulator) for function in functions]
-    return [each for each in found if each is not None]
+    return [candidate for candidate in found if candidate is not None]
 
 
 def _outliers(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -188,15 +190,7 @@ def _compare_times(name: str, vehicle: Array, simulator: Array, threshold_s: flo
     """Compare the means of block values (B,) s of both sides; differences below a threshold do not matter."""
     if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
         return None
-    means: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
-    is_present = tuple(abs(float(each.mean())) > threshold_s for each in (vehicle, simulator))
-    gap = abs(float(vehicle.mean() - simulator.mean()))
-    return Candidate(
-        name,
-        "s",
-        means[0],
-        means[1],
-        welch(vehicle, simulator),
-        (is_present[0], is_present[1]),
-        matters=gap > threshold_s,
-    )
+    is_present = abs(float(vehicle.mean())) > threshold_s, abs(float(simulator.mean())) > threshold_s
+    matters = abs(float(vehicle.mean() - simulator.mean())) > threshold_s
+    p = welch(vehicle, simulator)
+    return Candidate(name, "s", mean_of(vehicle), mean_of(simulator), p, is_present, matters)

@@ -31,7 +31,7 @@ CONFIGURATIONS = on_page(
     reject(
         "DVL_AXES_TURNED",
         "the DVL's axes look turned over: y and z point the other way",
-        means="Forward-right-down for forward-left-up, or the reverse.",
+        means="The driver sends forward-right-down for forward-left-up, or the reverse.",
         remedy="set {parameter} to {value}",
     ),
     reject(
@@ -46,8 +46,8 @@ CONFIGURATIONS = on_page(
         "the DVL's y points the other way: in turns the speed ahead shows {slope:.1f} ± {std:.1f} times the current "
         "that y shows",
         means=(
-            "Left-handed axes of the DVL, forward-right-down for forward-left-up, or a heading that counts the other "
-            "way."
+            "The DVL's axes are left-handed, or forward-right-down for forward-left-up, or the heading counts the "
+            "other way."
         ),
         remedy="negate y in the DVL's driver; if z points the other way as well, set dvl_axes to {axes}",
     ),
@@ -62,7 +62,7 @@ CONFIGURATIONS = on_page(
     reject(
         "DVL_AXIS_SCALED",
         "the DVL's {axis} is {factor:.2g} times its true value, and its {other} is not",
-        means="Wrong beam angles or beam matrix.",
+        means="The beam angles or the beam matrix in the driver are wrong.",
         remedy="check the beam angle and the beam order in the DVL's driver",
     ),
     reject(
@@ -123,7 +123,7 @@ CONFIGURATIONS = on_page(
     reject(
         "RATES_SCALED",
         "an angular velocity that is {times:.2g} times as large",
-        means="Not in rad/s, or of a wrong scale.",
+        means="The driver does not send rad/s, or its scale is wrong.",
     ),
     reject("RATES_IN_EARTH", "an angular velocity about the axes of the earth ({frame}), not of the body"),
     reject(
@@ -134,7 +134,7 @@ CONFIGURATIONS = on_page(
     reject(
         "RATES_TURNED",
         "an angular velocity whose axes are rotated by {degrees:.0f}° from the attitude's",
-        means="Two instruments in one message, or one is corrected for its mounting alone.",
+        means="Two instruments share one message, or only one of them is corrected for its mounting.",
     ),
     # gravity; alone it rejects no calibration, as no calibration uses the acceleration
     accept(
@@ -175,7 +175,7 @@ CONFIGURATIONS = on_page(
     reject(
         "CLOCK_OFF",
         "{whose} stamps are {seconds:.3f} ± {std:.3f} s {way} against {against}",
-        means="Estimated from velocities and turns.",
+        means="The offset is estimated from velocities and turns.",
     ),
     reject(
         "CLOCK_LATE",
@@ -242,13 +242,13 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_SIDEWAYS",
         "with the mounting {given} the vehicle travels sideways; it goes ahead with {found}",
-        means="A yaw or an axis of the wrong sign, or a vehicle that drifts.",
+        means="A yaw or an axis has the wrong sign, or the vehicle drifts.",
         remedy="try -p mounting_rpy:={option}{also}",
     ),
     reject(
         "TRAVELS_ASTERN",
         "with the mounting {given} the vehicle travels astern; it goes ahead with {found}",
-        means="A vehicle that drives astern looks the same; a mounting configured with -p is used without a check.",
+        means="A vehicle that was driven astern gives the same data. A mounting set with -p is used without a check.",
         remedy="try -p mounting_rpy:={option}{also}; if the vehicle did drive astern, record it driving ahead",
     ),
     marginal(
@@ -282,14 +282,14 @@ DISCOVERIES = on_page(
     accept(
         "SEVERAL_REFERENCES",
         "{topic} is taken as the reference, not {others}; --gnss-topic names another",
-        means="Satellites go first, then a simulator's truth, then an INS.",
+        means="Satellite navigation is preferred, then a simulator's truth, then an INS.",
     ),
     accept("FRAME_NOT_IN_TREE", "no transform for the DVL's frame {frame!r}; using frame {other!r} instead"),
     accept("REFERENCE_FRAME_NOT_TOLD", "{topic}: its frame is unknown, and not observable without an IMU"),
     accept(
         "MOUNTING_GUESSED",
         "mounting {mounting}, {why}: nothing in the bag says how the DVL is mounted (-p mounting_rpy:={option}){also}",
-        means="Estimated from the data, rounded to a quarter turn where that fits.",
+        means="The mounting is estimated from the data, and rounded to a quarter turn where that fits.",
     ),
     accept(
         "TRANSFORM_NOT_ROTATION",

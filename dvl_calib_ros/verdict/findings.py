@@ -25,7 +25,7 @@ FINDINGS = (
     error(
         "DVL_SILENT",
         "no usable DVL message for {seconds:.0f} s",
-        means="Other findings can say why.",
+        means="Another finding may name the cause.",
         remedy="check the sensor, its driver and the topic {topic}",
     ),
     warning(
@@ -65,7 +65,7 @@ FINDINGS = (
     warning(
         "STAMP_MISSING",
         "{stream}: messages without a header stamp, the time of reception is used",
-        means="`header.stamp` is zero; the time of reception is late.",
+        means="`header.stamp` is zero, and a message is received later than it was measured.",
         remedy="let the driver fill header.stamp",
     ),
     warning(
@@ -76,7 +76,7 @@ FINDINGS = (
     warning(
         "STAMPS_FAR",
         "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, too far from the others",
-        means="A computer without a clock battery.",
+        means="The clock of a computer was not set, for instance without a clock battery.",
         remedy=(
             "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording"
         ),
@@ -95,7 +95,7 @@ FINDINGS = (
     warning(
         "SAMPLES_LATE",
         "{count} {stream} samples arrived too late for their DVL samples and are not used",
-        remedy="raise max_latency; for a bag that is played at ten times its speed, ten times as high",
+        remedy="raise max_latency; if a bag is played at ten times its speed, to ten times the value",
     ),
     warning(
         "MODEL_RESTARTED",
@@ -107,32 +107,32 @@ FINDINGS = (
     warning(
         "STAMP_REPEATED",
         "{count} {stream} samples repeat the stamp of the one before; they are not used",
-        means="Two publishers on one topic, or a driver that sends twice.",
+        means="There are two publishers on one topic, or the driver sends twice.",
         remedy="stop the second publisher (ros2 topic info -v)",
     ),
     warning(
         "STAMP_OUT_OF_ORDER",
         "{count} {stream} samples are older than the one before; they are not used",
-        means="Two publishers on one topic, or a clock set back by less than `max_time_jump`.",
+        means="There are two publishers on one topic, or a clock was set back by less than `max_time_jump`.",
         remedy="stop the second publisher (ros2 topic info -v), set clocks before the run",
     ),
     warning(
         "TOPIC_SEVERAL_PUBLISHERS",
         "{topic}: {count} publishers ({names}), where one is expected",
-        means="Two drivers, or a bag next to the driver: samples mix.",
+        means="Two drivers run, or a bag is played next to the driver: their samples mix.",
         remedy="stop the others",
     ),
     warning(
         "TOPIC_OTHER_TYPE",
         "{topic}: {name} publishes {type} instead of {expected}; its messages are not received",
-        means="The warning names the parameter.",
+        means="The remedy in the warning names the parameter to set.",
         remedy="{remedy}",
     ),
     warning(
         "TOPIC_QOS",
         "{topic}: the QoS of {name} is incompatible; its messages are not received ({reason})",
-        means="The publisher offers less than the node asks for.",
-        remedy="set the publisher's durability to volatile, its reliability to either",
+        means="The publisher offers less reliability or durability than the node requests.",
+        remedy="set the publisher's durability to volatile; either reliability works",
     ),
     warning(
         "OUTPUT_QOS",
@@ -142,13 +142,13 @@ FINDINGS = (
     warning(
         "SECOND_NODE",
         "{topic}: {count} publishers ({names})",
-        means="Two calibration nodes, or a bag with recorded estimates.",
+        means="Two calibration nodes run, or a bag with recorded estimates is played.",
         remedy="stop the second node, or give one a namespace (--ros-args -r __ns:=/port) and its own result_file",
     ),
     warning(
         "TF_TWICE",
         "another node publishes a transform to {frame!r}, in addition to publish_tf",
-        means="Usually robot_state_publisher with the nominal mounting.",
+        means="Usually it is robot_state_publisher, with the nominal mounting.",
         remedy="turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
     ),
     warning(
@@ -169,7 +169,7 @@ FINDINGS = (
     warning(
         "DVL_FRAME",
         "dvl: a message has frame_id {frame_id!r} where {expected!r} is expected; it is not used",
-        means="Another frame than configured, or the body's.",
+        means="The message's frame is not the configured one, or it is the body's.",
         remedy=(
             "let the driver publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is "
             "its name"
@@ -179,13 +179,13 @@ FINDINGS = (
         "DVL_TURNED_TWICE",
         "dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and mounting_rpy "
         "turns the DVL upside down as well",
-        means="Right only for a DVL that looks up.",
+        means="Both together are right only for a DVL that looks up.",
         remedy="if mounting_rpy describes a frame whose z points down, set dvl_axes to flu",
     ),
     warning(
         "REFERENCE_FRAME",
         "reference not used: its frame_id {frame_id!r} is neither {base} nor an earth frame",
-        means="Earth frames are enu, map, odom, world and ned. After a turn the node chooses by the data (`discover`).",
+        means="Earth frames are enu, map, odom, world and ned. `discover` chooses by the data after a turn.",
         remedy="set gnss_frame to body, enu or ned",
     ),
     warning(
@@ -202,7 +202,7 @@ FINDINGS = (
     warning(
         "MESSAGE_UNDECODABLE",
         "{stream}: a message could not be decoded ({reason}); it is skipped",
-        means="Truncated, or of another version of its package.",
+        means="The message is truncated, or of another version of its package.",
         remedy="rebuild the driver's messages; ros2 bag convert where the package is installed",
     ),
     warning(
@@ -235,9 +235,9 @@ FINDINGS = (
     ),
     warning(
         "DVL_REPEATS",
-        "{count} DVL samples repeat the velocity before exactly and are used",
+        "{count} DVL samples repeat the previous velocity exactly; they are used",
         means="Only a simulated velocity without noise repeats exactly.",
-        remedy="if its driver hangs, set max_repeats",
+        remedy="if the driver repeats its last velocity without a new measurement, set max_repeats",
     ),
     # GNSS
     warning(
@@ -253,7 +253,7 @@ FINDINGS = (
     warning(
         "GNSS_LOSSES",
         "GNSS was lost {count} times",
-        means="Antenna under water or shaded.",
+        means="The antenna was under water or shaded.",
         remedy="check its antenna; if models switch to and fro, raise gnss_hysteresis",
     ),
     warning(
@@ -329,22 +329,22 @@ FINDINGS = (
     ),
     warning(
         "ONE_SPEED",
-        "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
+        "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s like "
         "{degrees:.1f}° or {percent:.1f} %; σ includes an error of dvl_bias_std",
-        remedy="drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
+        remedy="drive at two speeds, one twice the other; set dvl_bias_std to the DVL's accuracy, if you know it",
     ),
     warning(
         "DVL_BIAS",
         "the DVL has the same velocity error at every speed, {axes} mm/s in the body, which "
         "looks like {degrees:.1f}° of misalignment at the usual speed",
-        means="A bias of the DVL's electronics, a rounding, or water that moves in its shell.",
+        means="The cause is a bias of the electronics, a rounding, or water that moves in the DVL's shell.",
         remedy="subtract the bias in the driver, or have the DVL serviced",
     ),
     warning(
         "BEAM_OFF",
         "one beam of the DVL is off by {percent:.0f} ± {std:.0f} %: the beam {azimuth:.0f}° to port of its x axis "
         "reads low, or the opposite beam high",
-        means="A fouled or damaged transducer, or bubbles before it; roll and yaw of the mounting are then wrong.",
+        means="A transducer is fouled, damaged or behind bubbles. Roll and yaw of the mounting are then wrong.",
         remedy="look at that transducer; a DVL that gives beam velocities can solve without it",
     ),
     warning(
@@ -352,7 +352,7 @@ FINDINGS = (
         "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
         "on every heading",
         means="The DVL tracks moving sediment or a layer of water.",
-        remedy="calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
+        remedy="calibrate where the bed is still; to estimate the bed's velocity: -p reference_offset_std:={std:g}",
     ),
     warning(
         "VELOCITY_SMOOTHED",
@@ -368,7 +368,7 @@ FINDINGS = (
     warning(
         "LEVER_ARM_CONTRADICTED",
         "the lever arm in the data differs from the configured one: {axes}",
-        means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
+        means="The position is wrong, or the IMU's heading, turn rate or clock. The configured arm is kept.",
         remedy=(
             "measure the positions of DVL and reference point (lever_arm, reference_position), then check the IMU's "
             "axes and clock"
@@ -388,7 +388,7 @@ FINDINGS = (
     ),
     warning(
         "ONE_HEADING",
-        "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
+        "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s like "
         "{degrees:.1f}° or {percent:.1f} %; σ includes the reference's constant error",
         remedy=(
             "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's "
@@ -408,13 +408,13 @@ FINDINGS = (
     ),
     warning(
         "INITIAL_CONTRADICTED",
-        "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so it is left out",
+        "the data contradict initial_calibration {file}: the mounting has moved {difference} since; it is not used",
         remedy="inspect the mounting; if it is right, save this result and start from that",
     ),
     warning(
         "RESULT_WORSE",
         "{path} is kept, because it is better ({before}); the newer result ({now}) is {beside}",
-        remedy="to use the newer result anyway, rename its file, or call ~/save_anyway",
+        remedy="to use the newer result anyway, rename the kept file, or call ~/save_anyway",
     ),
     warning(
         "RESULT_NOT_SAVED",
@@ -453,12 +453,12 @@ DOCTOR = on_page(
     error(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
-        remedy="record both together; if they were, check the clocks, and for import the times of both files",
+        remedy="record both together; if they were, check the clocks, or the times of both imported files",
     ),
     warning(
         "DOCTOR_REPEATED_STAMP",
         "{topic}: {share:.0%} of the stamps repeat the one before",
-        means="Two publishers, or a driver that sends twice.",
+        means="There are two publishers, or the driver sends twice.",
         remedy="stop the second publisher (ros2 topic info -v {topic})",
     ),
     error(
@@ -480,7 +480,7 @@ DOCTOR = on_page(
     warning(
         "DOCTOR_ZEROS",
         "{topic}: {share:.0%} of the velocities are exactly zero",
-        remedy="let the driver send nothing, or mark it invalid; these are not used",
+        remedy="let the driver send nothing without a measurement, or mark the velocity invalid; zeros are not used",
     ),
     warning(
         "DOCTOR_REFUSED",
@@ -508,7 +508,7 @@ DOCTOR = on_page(
     warning(
         "DOCTOR_NOT_FINITE",
         "{topic}: {share:.0%} of the velocities are not finite",
-        remedy="check lock or fix at that time; these are not used",
+        remedy="check bottom lock or fix at that time; such velocities are not used",
     ),
     error(
         "DOCTOR_NO_ORIENTATION",
@@ -528,12 +528,12 @@ DOCTOR = on_page(
     error(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
-        remedy="let its driver convert to m/s; check the beam angle and the beam order of the DVL as well",
+        remedy="let the driver convert to m/s; check the beam angle and the beam order of the DVL as well",
     ),
     error(
         "DOCTOR_DISAGREE",
         "DVL and reference do not agree in any frames: {left:.0%} of the speed stays unexplained",
-        means="A wrong heading, clocks that differ by seconds, another vehicle's data, or water track.",
+        means="The heading is wrong, clocks differ by seconds, or the data are another vehicle's or in water track.",
         remedy="check the IMU's heading (yaw 0 is east and counts to the left), the stamps, and the DVL's bottom lock",
     ),
     warning("DOCTOR_FRAMES", "{says}", remedy="check frames and transforms"),

@@ -25,7 +25,7 @@ class Severity(Enum):
 
 # severities of a verdict by its word
 VERDICT_WORDS: Mapping[str, Severity] = {
-    each.value: each for each in (Severity.ACCEPT, Severity.MARGINAL, Severity.REJECT)
+    severity.value: severity for severity in (Severity.ACCEPT, Severity.MARGINAL, Severity.REJECT)
 }
 
 

@@ -74,14 +74,14 @@ class Reason:
     @property
     def _words(self) -> dict[str, Any]:
         return {
-            name: " and ".join(cause.sentence for cause in causes) if (causes := _causes(each)) else each
-            for name, each in self.numbers.items()
+            name: " and ".join(cause.sentence for cause in causes) if (causes := _causes(number)) else number
+            for name, number in self.numbers.items()
         }
 
     @property
     def causes(self) -> tuple[Reason, ...]:
         """Reasons among the values."""
-        return tuple(cause for each in self.numbers.values() for cause in _causes(each))
+        return tuple(cause for number in self.numbers.values() for cause in _causes(number))
 
     def __str__(self) -> str:
         remedy = self.remedy
@@ -100,7 +100,7 @@ class Reason:
             "remedy": self.remedy,
             "page": self.page,
             "numbers": {name: _plain(value) for name, value in self._words.items()},
-            **({"causes": [each.as_dict() for each in self.causes]} if self.causes else {}),
+            **({"causes": [cause.as_dict() for cause in self.causes]} if self.causes else {}),
         }
 
 
@@ -136,11 +136,11 @@ _COST_OF_AMBIGUITY: Mapping[str, Callable[[Mapping[str, Any]], float]] = {
 def of_consequence(reasons: Iterable[Reason], target_m_per_km: float) -> list[Reason]:
     """Omit warnings that matter little for an accepted calibration: their drift is below the target."""
     return [
-        each
-        for each in reasons
-        if each.severity is not Severity.WARNING
-        or each.code not in _COST_OF_AMBIGUITY
-        or _COST_OF_AMBIGUITY[each.code](each.numbers) > target_m_per_km
+        reason
+        for reason in reasons
+        if reason.severity is not Severity.WARNING
+        or reason.code not in _COST_OF_AMBIGUITY
+        or _COST_OF_AMBIGUITY[reason.code](reason.numbers) > target_m_per_km
     ]
 
 
@@ -159,7 +159,7 @@ def is_cause(reason: Reason) -> bool:
 
 def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
     """Sort by severity, the worst first; within one severity in causal order."""
-    return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), causal_rank(each)))
+    return sorted(reasons, key=lambda reason: (_WORST_FIRST.index(reason.severity), causal_rank(reason)))
 
 
 def lookup(kinds: Iterable[Kind]) -> str:
@@ -175,7 +175,7 @@ def _cause_and_remedy(kind: Kind) -> str:
 
 def _causes(value: object) -> tuple[Reason, ...]:
     found = value if isinstance(value, tuple) else (value,)
-    return tuple(each for each in found if isinstance(each, Reason))
+    return tuple(reason for reason in found if isinstance(reason, Reason))
 
 
 def _plain(value: object) -> object:

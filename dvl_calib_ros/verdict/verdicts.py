@@ -35,7 +35,7 @@ VERDICTS = on_page(
     marginal(
         "DRIFT_OPEN",
         "with this calibration dead reckoning may still drift by {open:.0f} m per km (1σ), more than {limit:.0f}",
-        means="Up to five times `target_drift` is accepted.",
+        means="A predicted drift of up to five times `target_drift` is accepted.",
         remedy="drive on: other headings, other speeds, turns to both sides",
     ),
     # estimated values
@@ -51,12 +51,12 @@ VERDICTS = on_page(
     reject(
         "SCALE_LARGE",
         "a scale is {percent:.1f} % off, more than {limit:.1f} %",
-        means="Wrong units, speed of sound or reference (`max_scale_error`).",
+        means="Units, speed of sound or reference are wrong. Limit: `max_scale_error`.",
     ),
     accept(
         "MOUNTING_FAR",
         "inspect the mounting: it is {degrees:.1f}° from mounting_rpy, more than {limit:.1f}°",
-        means="The calibration may be good and the bracket bent (`accept_misalignment`).",
+        means="The calibration may be good and the bracket bent. Limit: `accept_misalignment`.",
     ),
     marginal(
         "LEVER_ARM_NOT_SHOWN",
@@ -74,22 +74,22 @@ VERDICTS = on_page(
     accept("HELD_OUT", _HELD_OUT),
     marginal(
         "HELD_OUT_TOO_FEW",
-        "too few samples with a reference velocity to verify it on held-out data",
-        means="Fewer than 20 samples, or all in one stretch.",
+        "too few samples with a reference velocity to verify the calibration on held-out data",
+        means="There are fewer than 20 samples, or all are in one stretch.",
     ),
     marginal("HELD_OUT_OUTLIERS", _HELD_OUT + ", {typical:.3f} without outliers: there are many of them"),
-    reject("HELD_OUT_WORSE", _HELD_OUT + ": the calibration makes it worse"),
+    reject("HELD_OUT_WORSE", _HELD_OUT + ": the calibration increases the error"),
     marginal("HELD_OUT_NO_BETTER", _HELD_OUT + ": the calibration makes no difference, perhaps for lack of data"),
     reject(
         "HELD_OUT_SEVERAL_TIMES",
         _HELD_OUT + ": the error is several times the predicted one",
-        means="More than three times.",
+        means="The error is more than three times the predicted one.",
         remedy="the configuration is wrong, or an effect is missing from the model (dvl-calib diagnose looks for it)",
     ),
     reject(
         "HELD_OUT_IMPLAUSIBLE",
         _HELD_OUT + ": implausibly small, as if the DVL were fused into the reference, which then cannot judge it",
-        remedy="take GNSS alone",
+        remedy="use the velocity of GNSS alone as the reference",
     ),
     marginal(
         "HELD_OUT_NOISIER",
@@ -116,8 +116,8 @@ VERDICTS = on_page(
     # several recordings
     reject(
         "BAGS_OVERLAP",
-        "{first} and {second} hold the DVL at the same time, so of many samples only the first is used",
-        means="One recording twice, or two DVLs.",
+        "{first} and {second} hold the DVL at the same time, so of samples at one time only the first is used",
+        means="One recording is given twice, or there are two DVLs.",
         remedy="replay each by itself, and compare them",
     ),
     reject(
@@ -150,7 +150,7 @@ MANOEUVRES = on_page(
     accept("NEXT_REJECTED", "nothing: the findings say why this calibration is not to be used"),
     accept("NEXT_STANDS", "keep on until the drift has stayed on target"),
     accept("NEXT_IS_GOOD", "good enough: save"),
-    accept("NEXT_IS_GOOD_BUT_SCALE", "as good as it gets without a reference: save; the scale stays unknown"),
+    accept("NEXT_IS_GOOD_BUT_SCALE", "as accurate as possible without a reference: save; the scale stays unknown"),
     accept(
         "LONGER_AS_DRIFT_GREW",
         "it takes longer than promised: the predicted drift has grown from {before:.1f} to {now:.1f} m per km",
@@ -270,7 +270,7 @@ _FALLS = "the error falls from {before:.1f} to {after:.1f} mm/s on held-out data
 DIAGNOSES = on_page(
     "troubleshooting.md#what-a-diagnosis-says",
     accept("GAP_EXPLAINED", "the gap is {explained} by {names}: " + _FALLS),
-    marginal("GAP_AMBIGUOUS", "the gap is {explained} by {names}: " + _FALLS + "; this data cannot tell which it is"),
+    marginal("GAP_AMBIGUOUS", "the gap is {explained} by {names}: " + _FALLS + "; these data cannot tell which"),
     reject(
         "GAP_PARTLY_UNKNOWN",
         "the gap is {explained} by {names}, and no effect of the library explains the rest: " + _FALLS,
@@ -296,7 +296,7 @@ DIAGNOSES = on_page(
     marginal(
         "GAP_TOO_SHORT",
         "no gap can be measured in this recording: {samples} samples over {seconds:.0f} s are too few",
-        means="Samples with DVL, reference and attitude count.",
+        means="Only samples with DVL, reference and attitude count.",
         remedy="record {wanted:.0f} s at least, better 600 s",
     ),
     marginal(
@@ -326,7 +326,7 @@ DIAGNOSES = on_page(
 UNPAIRED = on_page(
     "troubleshooting.md#what-a-comparison-with-a-simulator-says",
     reject("SIMULATOR_LACKS", "the simulator lacks {names}"),
-    reject("SIMULATOR_OTHER_SIZE", "the simulator has {names} of another size"),
+    reject("SIMULATOR_OTHER_SIZE", "the simulator has {names} of another size than the vehicle"),
     reject("SIMULATOR_ALONE_HAS", "the simulator has {names}, which the vehicle lacks"),
     marginal("SIMULATOR_FRAME", "the simulator's DVL is mounted {simulator}, the vehicle's {vehicle}"),
     accept(
@@ -336,18 +336,18 @@ UNPAIRED = on_page(
     accept(
         "SIMULATOR_ROUNDS",
         "after round {round}, with {names}, the simulator's error on the vehicle's own motion is {after:.1f} mm/s "
-        "instead of {before:.1f}, held out; noise alone makes {floor:.1f}",
+        "instead of {before:.1f}, held out; noise alone causes {floor:.1f}",
     ),
     marginal(
         "SIMULATOR_ROUNDS_IN_VAIN",
         "corrected, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
-        "held out; noise alone makes {floor:.1f}",
+        "held out; noise alone causes {floor:.1f}",
         means="In no round was the corrected simulator closer to the vehicle than the simulator as recorded.",
     ),
     marginal(
         "SIMULATOR_NOT_ADDED",
-        "no round corrects {names}",
-        means="It happens at a time of a run, differs between recordings, or is observable in one of both logs only.",
+        "no round of corrections can remove {names}",
+        means="The effect happens once in a run, differs between recordings, or is observable in one log only.",
     ),
     accept(
         "SIMULATOR_NO_ROUNDS",
@@ -362,7 +362,7 @@ UNPAIRED = on_page(
     marginal("SIMULATOR_NOISE", "the noise differs in {names}"),
     marginal(
         "SIMULATOR_UNKNOWN_REST",
-        "something in the log of the {sides} follows no effect of the library",
+        "a part of the error in the log of the {sides} follows no effect of the library",
         means="The diagnosis of that side says `unknown`.",
     ),
     marginal(

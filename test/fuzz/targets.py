@@ -201,7 +201,7 @@ def run_log_times(data: bytes) -> None:
     kept = {topic: sum(map(len, parts)) for topic, parts in recording.columns.items()}
     aside = [int(each[1]) for note in recording.notes for each in re.finditer(r"(\d+) of \d+ messages are set", note)]
     assert sum(kept.values()) + sum(aside) == len(messages)
-    assert set(recording.survey.looks) == {topic for topic, count in kept.items() if count}
+    assert set(recording.survey.previews) == {topic for topic, count in kept.items() if count}
     if len(times) >= 200 and len(usual := [each for each in times if each >> 40 == times[0] >> 40]) > 0.99 * len(times):
         first_ns, last_ns = recording.span_ns
         assert last_ns - first_ns <= max(usual) - min(usual) + 2 * SEGMENT_GAP_NS

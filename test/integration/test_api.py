@@ -156,7 +156,7 @@ def test_the_other_functions_give_dataclasses(tmp_path, bag):
     assert dc.doctor(made).verdict == "yes"
     checked = dc.evaluate([bag, made], models=["M3"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
     assert checked.models == ("M3",)
-    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
+    assert repr(checked).startswith(f"{checked.verdict}: On the other bags, M3 leaves ")
     assert dc.replay([made], gnss_topic="none").model == "unaided"
     with pytest.raises(dc.InputError, match="none of"):
         dc.evaluate(models=["M9"])

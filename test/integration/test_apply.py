@@ -419,7 +419,7 @@ def test_rollback_touches_nothing_when_one_file_has_no_backup(tmp_path, saved, c
         (["--urdf", "r.urdf"], "name a result file"),
         (["missing.yaml"], "missing.yaml: no such result file"),
         (["result.yaml", "--fusion", "result.yaml"], "would write over the input result.yaml"),
-        (["result.yaml", "--fusion", "x", "--launch", "x"], "names of their own"),
+        (["result.yaml", "--fusion", "x", "--launch", "x"], "a name of its own"),
         (["result.yaml", "--urdf", "missing.urdf"], "missing.urdf: no such URDF"),
         (["result.yaml", "-o", "x"], "need --urdf"),
         (["result.yaml", "--joint", "x"], "need --urdf"),

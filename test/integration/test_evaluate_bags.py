@@ -40,7 +40,7 @@ def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_de
     assert document["selected"][monday] == "full"
     navigation = document["navigation"][monday][tuesday]
     assert navigation["drift_m_per_km"]["after"] < navigation["drift_m_per_km"]["before"]
-    assert "Dead reckoning on bags that were not calibrated on" in said
+    assert "Dead reckoning on the other bags" in said
     text = page.read_text()
     assert text.count("<img") == 4 and "Track, monday" in text and "Error of position, tuesday" in text
 
@@ -58,7 +58,7 @@ def test_topics_are_found_as_by_replay_and_the_answer_is_said_first_with_warning
                 target.message(renamed[topic], message.__msgtype__, log_ns, message)
     said, warned = succeed(capsys, "evaluate", *named, "--models", "M3", "--jobs", "1")
     # M3 knows nothing of the arm and the clock that these days differ by
-    assert said.startswith("not_better: On bags that were not calibrated on M3 leaves a velocity error of ")
+    assert said.startswith("not_better: On the other bags, M3 leaves a velocity error of ")
     assert "DVL /a50/velocity" in said and "reference /rtk/velocity" in said
     assert not any(f"{name}: " in warned for name in ("full", "M7", "unaided"))
 
@@ -86,4 +86,4 @@ def test_a_bag_whose_replay_fails_is_named_and_the_others_are_checked(bags, tmp_
     monkeypatch.setattr(evaluation_of_bags, "_replay_one", lambda *_: real())
     assert main(["evaluate", *map(str, bags), "--models", "M3", "--jobs", "1"]) == 2
     error = capsys.readouterr().err
-    assert "nothing is left to check" in error and "TypeError" in error and error.count("\n") == 1
+    assert "no bag is left to check" in error and "TypeError" in error and error.count("\n") == 1

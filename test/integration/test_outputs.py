@@ -242,7 +242,7 @@ def test_no_two_outputs_can_be_one_file_by_any_name(scratch, capsys, name):
                 second = Path("out.bak") if how == "backup" else ALIASES[how](folder, Path("out"))
                 before = snapshot(folder)
                 error = refused(capsys, [*command.arguments.split(), one, "out", other, str(second)])
-                assert "names of their own" in error
+                assert "a name of its own" in error
                 assert snapshot(folder) == before
 
 
@@ -257,7 +257,7 @@ def test_names_that_are_one_on_other_file_systems_are_not_written_both(scratch, 
     if one == "a/x":  # other folders, other names
         assert main(words) == 0
         return
-    assert "names of their own" in refused(capsys, words)
+    assert "a name of its own" in refused(capsys, words)
     assert snapshot(folder) == before
 
 
@@ -282,7 +282,7 @@ def test_a_bag_that_is_mounted_in_two_places_is_written_into_by_neither_name(mou
     ):  # fmt: skip
         assert "the input" in refused(capsys, words.split())
     words = "replay loose/run.db3 --json bag/new.json --save twice/new.json"
-    assert "names of their own" in refused(capsys, words.split())
+    assert "a name of its own" in refused(capsys, words.split())
     assert snapshot(mounted) == before
 
 

@@ -120,7 +120,7 @@ def _check_no_chunk(file: BinaryIO, start: int, size: int) -> None:
             raise DamagedError(f"its index would begin at byte {start}, before {'messages' if opcode else 'zeros'}")
         if opcode == Opcode.FOOTER:
             if at != size - _FOOTER.size - RECORD_HEAD.size:
-                raise DamagedError("its index is of another part of it: recordings joined in one file")
+                raise DamagedError("its index belongs to another part: several recordings were joined in one file")
             return
         at += RECORD_HEAD.size + length
 
@@ -206,13 +206,13 @@ def _whole_chunk(
     if chunk.damage:
         raise DamagedError(chunk.damage)
     starts = _indexed_starts(file, index, chunk.end)
-    places = None if starts is None else places_by_index(chunk.records, starts, tables)
-    places = places or places_of(chunk.records, tables)
-    if places is not None:
-        found = Batch(times(places.log_ns), *places[1:], chunk.records, channels)
+    located = None if starts is None else places_by_index(chunk.records, starts, tables)
+    located = located or places_of(chunk.records, tables)
+    if located is not None:
+        batch = Batch(times(located.log_ns), *located[1:], chunk.records, channels)
         if len(channels) < len(tables.channels):
-            found = found.part(np.isin(found.number, list(channels)))
-        return found.sorted()
+            batch = batch.part(np.isin(batch.number, list(channels)))
+        return batch.sorted()
     damage = Damage()
     messages = messages_of(at, chunk.records, tables, damage, channels)
     damage.raise_if_any()
@@ -308,6 +308,13 @@ class _FileWalk:
     def __init__(
         self, file: BinaryIO, size: int, tables: Tables, damage: Damage, indexes: Collection[ChunkIndex]
     ) -> None:
+        """Start before the first record.
+
+        file, size: the MCAP file and its length, bytes.
+        tables: known schemas and channels.
+        damage: receives the damage found.
+        indexes: chunk indexes of the summary, if readable.
+        """
         self._file, self._size, self._tables, self._damage = file, size, tables, damage
         self._indexes = {index.chunk_start_offset: index for index in indexes}
         self._may_hold_chunks = True
@@ -322,17 +329,17 @@ class _FileWalk:
         has_ended: set at the end of the data. held: messages of the record at `at` itself, which count only if the
         record leads on to another.
         """
-        found, self.held, before = self.held, [], None
+        messages, self.held, before = self.held, [], None
         try:
             self.held, end, before = self._record(at)
         except DamagedError as error:
-            place, is_before_damaged = self._resume_after(at)
+            resumed_at, is_before_damaged = self._resume_after(at)
             if is_before_damaged and self._before is not None:
-                found, at = [], self._before
-            self._damage.note(str(error), place - at)
-            end = place
+                messages, at = [], self._before
+            self._damage.note(str(error), resumed_at - at)
+            end = resumed_at
         self._before = before
-        return found, end
+        return messages, end
 
     def _record(self, at: int) -> tuple[list[Found], int, int | None]:
         """Return the messages of the record at `at`, its end, and its start if the end is uncertain."""

@@ -74,11 +74,12 @@ class Tables:
     """
 
     def __init__(self, summary: Summary | None) -> None:
+        """Start from the file's summary; None if it is lost."""
         self.schemas: dict[int, Schema] = dict(summary.schemas) if summary else {}
         self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
         self.eras: set[int] = set()
         self.lengths: dict[int, int] = {}
-        self._met = {(SCHEMA, each) for each in self.schemas} | {(CHANNEL, each) for each in self.channels}
+        self._met = {(SCHEMA, schema) for schema in self.schemas} | {(CHANNEL, channel) for channel in self.channels}
         self._made: dict[int, tuple[str, str, str, str]] = {}
         if summary and summary.statistics and summary.statistics.message_count:
             self.note_era(summary.statistics.message_start_time)
@@ -154,12 +155,12 @@ def search(
         file.seek(window)
         data = np.frombuffer(file.read(_WINDOW + RECORD_HEAD.size - 1), dtype=np.uint8)
         first_bytes = data[: max(len(data) - RECORD_HEAD.size + 1, 0)]
-        places = np.flatnonzero((first_bytes >= opcodes[0]) & (first_bytes <= opcodes[1]))
+        candidates = np.flatnonzero((first_bytes >= opcodes[0]) & (first_bytes <= opcodes[1]))
         for high in range(5, RECORD_HEAD.size):  # the upper half of the length
-            places = places[data[places + high] == 0]
-        for place in places.tolist():
-            if accept(window + place):
-                return window + int(place)
+            candidates = candidates[data[candidates + high] == 0]
+        for candidate in candidates.tolist():
+            if accept(window + candidate):
+                return window + int(candidate)
     return None
 
 
@@ -280,7 +281,7 @@ def message_head(
         raise DamagedError(f"at byte {at}: a message is of no known channel")
     expected = tables.lengths.get(channel, length)
     if expected != length and tables.eras:  # a damaged length may lead into the message or past others
-        ends = [offset + RECORD_HEAD.size + each for each in (expected, length)]
+        ends = [offset + RECORD_HEAD.size + size for size in (expected, length)]
         by_usual, by_own = (likeness(holds(end), n - end, tables) for end in ends)
         if by_usual == ALIKE and (expected < length or by_own < ENOUGH_ALIKE):
             raise DamagedError(f"at byte {at}: the length of a message is damaged")
@@ -484,12 +485,12 @@ def open_chunk(file: BinaryIO, at: int, length: int, size: int, index: ChunkInde
         length = head.size + head.packed_size
     else:
         head = chunk_head(file, at)
-    lengths = [each for each in (head.packed_size, length - head.size) if 0 <= each <= LARGEST_RECORD]
+    lengths = [packed for packed in (head.packed_size, length - head.size) if 0 <= packed <= LARGEST_RECORD]
     if not lengths or head.unpacked_size > LARGEST_RECORD:
         raise DamagedError(f"the chunk at byte {at} claims more than {LARGEST_RECORD} bytes")
     start = at + RECORD_HEAD.size + head.size
     if lengths[1:] and lengths[1] != lengths[0]:
-        lengths.sort(key=lambda each: not _record_follows(file, start + each, size, Tables(None)))
+        lengths.sort(key=lambda packed: not _record_follows(file, start + packed, size, Tables(None)))
     chunk = _unpack_chunk(file, at, start, head, lengths[0], size)
     if chunk.damage and lengths[1:] and lengths[1] != lengths[0]:
         other = _unpack_chunk(file, at, start, head, lengths[1], size)

@@ -111,10 +111,13 @@ def _note(row: _TableRow, topics: dict[int, _Topic], definitions: dict[tuple[str
 class _Pages:
     """Pages of a database file, numbered from 1.
 
-    size: bytes per page. missing: bytes by which the file is shorter than its header states. unread: unreadable pages.
+    size: bytes per page.
+    missing: bytes by which the file is shorter than its header states.
+    unread: unreadable pages.
     """
 
     def __init__(self, file: BinaryIO, size: int) -> None:
+        """Read page size and count from the header; assume the default if it is damaged. size: of the file, bytes."""
         header = file.read(_FILE_HEADER).ljust(_FILE_HEADER, b"\0")
         (page_size,) = struct.unpack_from(">H", header, 16)
         page_size = 65536 if page_size == 1 else page_size
@@ -214,5 +217,5 @@ def _columns(payload: bytes) -> list[Any]:
         offset += size
         values.append(value)
     if offset != len(payload):
-        raise ValueError("not as long as it says")
+        raise ValueError("its length differs from the announced one")
     return values

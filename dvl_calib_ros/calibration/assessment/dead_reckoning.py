@@ -2,6 +2,8 @@
 
 Integrated velocity errors give the position error. Each sample is corrected by an estimate that has not seen its
 stretch, including lever arm and delay, so the drift predicts later data. It includes the reference's noise.
+
+Shapes: N samples, K of them in the track, P points kept for the map.
 """
 
 from __future__ import annotations
@@ -64,7 +66,9 @@ class Drift:
 class SlowNoise(NamedTuple):
     """Slow errors of reference and attitude, first-order Gauss-Markov (σ).
 
-    velocity: m/s, per horizontal axis. heading: rad. memory_s: time constant, s.
+    velocity: m/s, per horizontal axis.
+    heading: rad.
+    memory_s: time constant, s.
     """
 
     velocity: float
@@ -148,13 +152,15 @@ def dead_reckoned(
 ) -> Navigation | None:
     """Compare the track of the DVL, uncorrected and corrected, with the reference; None without reference or motion.
 
-    folds: (N,) index into `terms` of each DVL sample's correction. epoch_ns: stamp of the recording's time 0. heading:
-    see `Estimate.heading_deviation`. slow, beam: None if not estimated.
+    folds: (N,) index into `terms` of each DVL sample's correction.
+    epoch_ns: stamp of the recording's time 0.
+    heading: see `Estimate.heading_deviation`.
+    slow, beam: None if not estimated.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
     n = len(recording.dvl.times)
-    before, after = _Level.of(n), _Level.of(n, whole=True)
+    before, after = _ErrorTable.of(n), _ErrorTable.of(n, whole=True)
     before.fill(recording, np.arange(n), NO_TERMS, parameters)
     for k, terms_of_fold in enumerate(terms):
         after.fill(recording, np.flatnonzero(folds == k), terms_of_fold, parameters)
@@ -167,12 +173,12 @@ def dead_reckoned(
     distance = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
     if not len(distance) or distance[-1] < SHORTEST_M:
         return None
-    errors = [each.error[used, axes] for each in (before, after)]
+    errors = [before.error[used, axes], after.error[used, axes]]
     track_errors = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
     if slow is not None and recording.reference.in_body.all():
         slow = slow._replace(heading=0.0)  # body velocities need no heading
     ends = ends_of_stretches(distance)
-    kept = np.round(np.linspace(0, len(used) - 1, min(MAP_POINTS, len(used)))).astype(np.intp)
+    shown = np.round(np.linspace(0, len(used) - 1, min(MAP_POINTS, len(used)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
         distance_m=float(distance[-1]),
@@ -183,25 +189,26 @@ def dead_reckoned(
         after=drift_over(track_errors[1], distance, ends),
         noise_per_km=_noise(errors[1], step_s, distance, ends, slow),
         on_a_map=on_a_map,
-        stamps_ns=np.round(recording.dvl.times[used[kept]] * 1e9).astype(np.int64) + epoch_ns,
-        distances=distance[kept],
-        reference=reference[kept],
-        track_before=(reference - track_errors[0])[kept],
-        track_after=(reference - track_errors[1])[kept],
-        error_before=before.in_body[used[kept]],
-        error_after=after.in_body[used[kept]],
+        stamps_ns=np.round(recording.dvl.times[used[shown]] * 1e9).astype(np.int64) + epoch_ns,
+        distances=distance[shown],
+        reference=reference[shown],
+        track_before=(reference - track_errors[0])[shown],
+        track_after=(reference - track_errors[1])[shown],
+        error_before=before.in_body[used[shown]],
+        error_after=after.in_body[used[shown]],
         deviation=heading_deviation(after.yaw[used], heading) if on_a_map and heading is not None else None,
         followed=_followed(recording, after, used, parameters) if on_a_map else None,
         beam=beam,
     )
 
 
-class _Level(NamedTuple):
+class _ErrorTable(NamedTuple):
     """Reference velocity and DVL error of N samples.
 
-    velocity, error: (N, 4) m/s, forward, port, east, north, the latter two where oriented (N,). yaw: (N,) rad. in_body:
-    (N, 3) m/s, error. whole: if requested, rotation_enu_from_body (N, 3, 3), velocity and error (N, 3) m/s, rates
-    (N, 3) rad/s, body axes.
+    velocity, error: (N, 4) m/s, forward, port, east, north, the latter two where oriented (N,).
+    yaw: (N,) rad.
+    in_body: (N, 3) m/s, error.
+    whole: if requested, rotation_enu_from_body (N, 3, 3), velocity and error (N, 3) m/s, rates (N, 3) rad/s, body axes.
     """
 
     velocity: Array
@@ -212,11 +219,11 @@ class _Level(NamedTuple):
     whole: tuple[Array, ...]
 
     @staticmethod
-    def of(n: int, *, whole: bool = False) -> _Level:
+    def of(n: int, *, whole: bool = False) -> _ErrorTable:
         """Return an empty table of n samples."""
         error = np.empty((n, 3))
         kept = (np.empty((n, 3, 3)), np.empty((n, 3)), error, np.empty((n, 3))) if whole else ()
-        return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
+        return _ErrorTable(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
 
     def fill(self, recording: ThinnedRecording, rows: Index, terms: Terms, parameters: Parameters) -> None:
         """Fill in some samples, corrected by these terms."""
@@ -235,9 +242,9 @@ class _Level(NamedTuple):
                 columns[part, 2:] = np.matmul(data.rotation_enu_from_body, body[..., None])[:, :2, 0]
 
 
-def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Parameters) -> ResidualTrend | None:
+def _followed(recording: ThinnedRecording, after: _ErrorTable, use: Index, p: Parameters) -> ResidualTrend | None:
     """Return `residual_trend` of the samples in use; None without turn rates, as lever arms then look like signals."""
-    rotation, velocity, error, rates = (each[use] for each in after.whole)
+    rotation, velocity, error, rates = (column[use] for column in after.whole)
     if np.isnan(rates).any():
         return None
     interval_s = float(median(np.diff(recording.reference.times)))
@@ -272,7 +279,9 @@ def drift_over(error_of_track: Array, distance: Array, ends: Index) -> Drift:
 def _noise(errors: Array, step_s: Array, distance: Array, ends: Index, slow: SlowNoise | None) -> float:
     """Return the drift by white and slow noise, m per km, rms over stretches.
 
-    errors: (K, 2) m/s; differences of neighbours give the white noise. step_s: (K,) s. distance: (K,) m driven.
+    errors: (K, 2) m/s; differences of neighbours give the white noise.
+    step_s: (K,) s.
+    distance: (K,) m driven.
     ends: (S + 1,) indices of the ends of stretches.
     """
     if len(errors) < 3:
@@ -363,7 +372,7 @@ def doubts(
     """
     reasons = [finding("IMU_LEVEL")] if is_level else []
     if not suggested:
-        reasons += [each.weighed(Severity.MARGINAL) for each in lever_arm_warnings(finders, parameters)]
+        reasons += [reason.weighed(Severity.MARGINAL) for reason in lever_arm_warnings(finders, parameters)]
     if navigation is None:
         return reasons
     bed_reason = moving_bed(navigation.followed, estimate)

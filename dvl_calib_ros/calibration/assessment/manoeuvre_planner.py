@@ -34,9 +34,10 @@ _COMPASS = (("north", 0.0), ("east", 90.0), ("south", 180.0), ("west", 270.0))
 class RecentMotion(NamedTuple):
     """Motion of the vehicle.
 
-    speed: m/s. heading: rad, counterclockwise from east; None if unknown. in_earth: whether the reference is in an
-    earth frame, so that its constant error rotates relative to the vehicle. noise: (m/s)² per axis, of one second of
-    reference and DVL.
+    speed: m/s.
+    heading: rad, counterclockwise from east; None if unknown.
+    in_earth: whether the reference is in an earth frame, so that its constant error rotates relative to the vehicle.
+    noise: (m/s)² per axis, of one second of reference and DVL.
     """
 
     speed: float
@@ -80,7 +81,10 @@ def noise_of_a_second(estimate: Estimate, parameters: Parameters, seconds: float
 
 
 def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, before: Reason | None = None) -> Outlook:
-    """Return the next manoeuvre: of ten, repeatedly the one with the smallest predicted drift, until that is on target.
+    """Return the next manoeuvre, and the time until the predicted drift is on target.
+
+    The manoeuvre that reduces the predicted drift most is added to the information again and again, until the drift is
+    on target. The first one is the next manoeuvre.
 
     before: the last suggestion, kept unless another is clearly better.
     """
@@ -94,11 +98,8 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
     # correlated samples hold less information than the filter assumes, by this factor
     claimed_drift = predicted_drift(model, estimate.filter_covariance, parameters)
     excess = max(1.0, (drift.both / max(claimed_drift.both, 1e-9)) ** 2)
-    candidates = [
-        (reason, _information(model, parameters, motion, *course) / excess)
-        for reason, course in _manoeuvres(motion).values()
-    ]
-    gains = np.array([gain for _, gain in candidates])
+    reasons, courses = zip(*_manoeuvres(motion).values(), strict=True)
+    gains = np.array([_information(model, parameters, motion, *course) / excess for course in courses])
     information = np.linalg.pinv(estimate.velocity_covariance)
     chosen, seconds = None, 0.0
     for _ in range(MAX_MANOEUVRES):
@@ -106,8 +107,8 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
         drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, posterior, rows))
         best = int(np.argmin(drifts))
         if chosen is None:
-            chosen = candidates[best][0]
-            for index, (reason, _) in enumerate(candidates):
+            chosen = reasons[best]
+            for index, reason in enumerate(reasons):
                 is_same = before is not None and (reason.code, _name(reason)) == (before.code, _name(before))
                 if is_same and drift.both - drifts[best] < REPLACED_FROM * (drift.both - drifts[index]):
                     chosen = reason

@@ -95,7 +95,7 @@ class Selection:
     def take(self, from_ns: int, evidence: Evidence) -> None:
         """Use an estimator's evidence from this stamp on."""
         if evidence is not NO_EVIDENCE:
-            insort(self._coming, (from_ns, evidence), key=lambda each: each[0])
+            insort(self._coming, (from_ns, evidence), key=lambda coming: coming[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         """Take DVL samples (N,) in order of stamps, and whether they were paired."""
@@ -116,7 +116,11 @@ class Selection:
             self._update(stamps_ns, paired, parameters)
 
     def _update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
-        """Take samples one by one where GNSS availability changes."""
+        """Take samples one by one where GNSS availability changes.
+
+        stamps_ns: (N,) of the DVL samples.
+        paired: (N,) whether each has a reference velocity.
+        """
         timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
         if parameters.model == AUTO:
             paired = paired | (stamps_ns < self._referenced_until_ns)

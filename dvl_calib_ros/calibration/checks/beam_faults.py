@@ -53,8 +53,9 @@ def effect_velocities(v: Array) -> Array:
 class BeamFault(NamedTuple):
     """Most significant beam.
 
-    share, std: missing share of its velocity, and σ. azimuth_deg: of the beam, from the DVL's x axis to port. off:
-    resulting error of the mean velocity, as a share of the speed.
+    share, std: missing share of its velocity, and σ.
+    azimuth_deg: of the beam, from the DVL's x axis to port.
+    off: resulting error of the mean velocity, as a share of the speed.
     """
 
     share: float
@@ -96,7 +97,7 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
         inflation = float(inflations([equations], x[None], posterior[None])[0, -1])
         candidates.append((float(x[-1]), math.sqrt(posterior[-1, -1]) * inflation, effect))
     no_beam = (0.0, 1.0, N_EFFECTS - 1)
-    share, std, effect = max(candidates, key=lambda each: abs(each[0]) / each[1], default=no_beam)
+    share, std, effect = max(candidates, key=lambda fault: abs(fault[0]) / fault[1], default=no_beam)
     if effect == N_EFFECTS - 1:  # the scale that grows with speed
         return None
     beam = effect - 1
@@ -104,12 +105,12 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     return BeamFault(abs(share), std, (AZIMUTHS_DEG[beam] + 180.0 * (share < 0.0)) % 360.0, relative)
 
 
-def beam_warning(found: BeamFault | None, accepted: float) -> list[Reason]:
+def beam_warning(fault: BeamFault | None, accepted: float) -> list[Reason]:
     """Return the reason against a calibration by a faulty beam; its roll and yaw are wrong by several σ.
 
     accepted: error of the velocity ahead, as a share of the speed, up to which a beam is not reported.
     """
-    if found is None or found.share < Z_FIFTY_TESTS * found.std or found.least < accepted:
+    if fault is None or fault.share < Z_FIFTY_TESTS * fault.std or fault.least < accepted:
         return []
-    percent, std = 100.0 * found.share, 100.0 * found.std
-    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.REJECT)]
+    percent, std = 100.0 * fault.share, 100.0 * fault.std
+    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=fault.azimuth_deg).weighed(Severity.REJECT)]

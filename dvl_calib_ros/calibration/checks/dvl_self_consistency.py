@@ -40,7 +40,7 @@ class DvlStream:
         if len(velocity) < FEWEST_VALUES:
             return
         change, change_of_two = steps(velocity), velocity[2:] - velocity[:-2]
-        square_of_two, square_of_one = (float(median((each**2).sum(axis=1))) for each in (change_of_two, change))
+        square_of_two, square_of_one = (float(median((step**2).sum(axis=1))) for step in (change_of_two, change))
         self._blocks += 1
         self._alternating += square_of_one > CHANGE_RATIO * square_of_two + CHANGE_MPS2
         self._n += len(change)

@@ -63,14 +63,14 @@ def heading_deviation(yaw: Array, coefficients: GaussianState) -> HeadingDeviati
     )  # fmt: skip
 
 
-def heading_warning(found: HeadingDeviation) -> Reason:
+def heading_warning(deviation: HeadingDeviation) -> Reason:
     """Return the warning; it rejects a calibration if the compass must be calibrated before the mounting."""
     degrees = math.degrees
-    is_first = found.rms > max(FIRST, Z_ONE_TEST * found.std)
+    is_first = deviation.rms > max(FIRST, Z_ONE_TEST * deviation.std)
     first = " first" if is_first else ""
     warning = finding(
-        "HEADING_DEVIATION", rms=degrees(found.rms), std=degrees(found.std), most=degrees(found.most),
-        most_at=degrees(found.most_at), least=degrees(found.least), least_at=degrees(found.least_at),
-        cost=1000.0 * found.rms, first=first,
+        "HEADING_DEVIATION", rms=degrees(deviation.rms), std=degrees(deviation.std), most=degrees(deviation.most),
+        most_at=degrees(deviation.most_at), least=degrees(deviation.least), least_at=degrees(deviation.least_at),
+        cost=1000.0 * deviation.rms, first=first,
     )  # fmt: skip
     return warning.weighed(Severity.REJECT if is_first else Severity.WARNING)

@@ -73,9 +73,10 @@ class AttitudeRates:
     def add(self, times: Array, orientation: Array, angular_velocity: Array, begins: Sequence[int] = (0,)) -> None:
         """Add the next samples in order of time.
 
-        times: (M,) s. orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``. angular_velocity: (M, 3)
-        rad/s, body. Both nan if not known. begins: indices of the first samples of stretches that are differentiated
-        separately.
+        times: (M,) s.
+        orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``.
+        angular_velocity: (M, 3) rad/s, body. Both nan if not known.
+        begins: indices of the first samples of stretches that are differentiated separately.
         """
         known = ~(np.isnan(orientation[:, 0]) | np.isnan(angular_velocity).any(axis=1))
         bounds = [*begins, len(times)]
@@ -110,17 +111,17 @@ class AttitudeRates:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")
-        given = self._misfit(_BODY, np.eye(3), axes)
-        if given < MIN_WRONG_SHARE * total:
+        misfit_as_sent = self._misfit(_BODY, np.eye(3), axes)
+        if misfit_as_sent < MIN_WRONG_SHARE * total:
             return None
         misfits = [(self._misfit(frame, matrix, axes), fits) for frame, matrix, fits in self._explanations()]
         best = min(misfit for misfit, _ in misfits)
-        if best > MAX_LEFT_SHARE * min(total, given):
+        if best > MAX_LEFT_SHARE * min(total, misfit_as_sent):
             return None
-        found, *others = (fits for misfit, fits in misfits if misfit <= EQUAL_FACTOR * best + 1e-3 * total)
+        best_fit, *others = (fits for misfit, fits in misfits if misfit <= EQUAL_FACTOR * best + 1e-3 * total)
         if others:
-            return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
-        return finding("IMU_CONTRADICTS", found=found)
+            return finding("IMU_CONTRADICTS_EITHER", found=best_fit, other=others[0])
+        return finding("IMU_CONTRADICTS", found=best_fit)
 
     def _misfit(self, frame: int, matrix: Array, observable: slice) -> float:
         """Return Σ|a - B w|² over the observable axes, for B (3, 3) and a frame of w."""

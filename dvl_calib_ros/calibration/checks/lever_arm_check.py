@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def lever_arm_warnings(estimates: Iterable[Estimate], parameters: Parameters) -> list[Reason]:
     """Return a reason if the data contradict the configured lever arm, by the first estimate that includes it."""
-    estimate = next((each for each in estimates if each.used and estimates_lever_arm(MODELS[each.model])), None)
+    estimate = next((fit for fit in estimates if fit.used and estimates_lever_arm(MODELS[fit.model])), None)
     if estimate is None:
         return []
     # without the clock's uncertainty: a delay, which looks the same at constant speed, is one of the causes

@@ -72,7 +72,7 @@ class SharedNoise:
         compared = _differences(times, step, velocity, reference_times, reference_step, reference)
         known = np.isfinite(compared.dvl_4) & np.isfinite(compared.reference_4)
         count = np.count_nonzero(known, axis=(1, 2))
-        dvl_2, dvl_4, reference_4 = (np.where(known, each, 0.0) for each in compared)
+        dvl_2, dvl_4, reference_4 = (np.where(known, column, 0.0) for column in compared)
         products = np.stack([dvl_4 * reference_4, dvl_4 * dvl_4, dvl_2 * dvl_2])
         c_4, v_4, v_2 = products.sum(axis=(2, 3)) / np.maximum(count, 1)
         is_enough = count >= (MIN_DIFFERENCES if reference_step <= SLOWEST_S else FEWEST_VALUES)

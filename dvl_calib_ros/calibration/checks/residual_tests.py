@@ -83,12 +83,16 @@ class ResidualTrend(NamedTuple):
     """Signals that the residual velocity follows.
 
     tilt, tilt_std: (2,) share of roll and pitch missing in the DVL's velocity: 0 if correct, 1 if levelled, ±2 for a
-    wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
-    of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
-    circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: the most significant
-    of `FILTER_MEMORIES_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
-    heading; 0 if the residual holds less than half of it. turned, turned_std: rad, change of the heading error from
-    start to end.
+      wrong sign.
+    bias, bias_std: (3,) m/s, of the DVL, body.
+    smoothed, smoothed_std: s², half the squared time constant of the reference; negative for the DVL.
+    lean: (2,) rad, mean roll and pitch.
+    speed: m/s, rms.
+    circular, circular_std: share of the DVL's noise that the reference keeps after one sample.
+    circular_s: the most significant of `FILTER_MEMORIES_S`.
+    over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every heading; 0 if the residual
+      holds less than half of it.
+    turned, turned_std: rad, change of the heading error from start to end.
     """
 
     tilt: Array
@@ -140,30 +144,30 @@ def residual_trend(
     """
     if len(time) < 3 or time[-1] - time[0] < FEWEST_VALUES * STRETCH_S:
         return None
-    seen = _ResidualSamples(time, rotation_enu_from_body, velocity - error, error, rates, interval_s)
+    samples = _ResidualSamples(time, rotation_enu_from_body, velocity - error, error, rates, interval_s)
     up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # -1 for a z-down body
     roll = np.arctan2(up * rotation_enu_from_body[:, 2, 1], up * rotation_enu_from_body[:, 2, 2])
     pitch = -np.arcsin(np.clip(rotation_enu_from_body[:, 2, 0], -1.0, 1.0))
     changing_tilt = [_mean(time, tilt, TILT_S[0]) - _mean(time, tilt, TILT_S[1]) for tilt in (roll, pitch)]
-    smoothed = _smoothed_motion(seen)
-    fast = _fit_fast_signals(seen, smoothed, changing_tilt)
-    means = _fit_means(seen, smoothed)
+    smoothed = _smoothed_motion(samples)
+    fast = _fit_fast_signals(samples, smoothed, changing_tilt)
+    means = _fit_means(samples, smoothed)
     if fast is None or means is None:
         return None
     tilt, tilt_std = fast.fit.x[-3:-1], fast.fit.std[-3:-1]
-    tilt_std[[each.std() < LEAST_TILT for each in changing_tilt]] = math.inf
+    tilt_std[[axis.std() < LEAST_TILT for axis in changing_tilt]] = math.inf
     # without tilt data, wave motion looks like turning
-    is_tilting = max(float(np.abs(each).max()) for each in changing_tilt) > LEVEL_BELOW
+    is_tilting = max(float(np.abs(axis).max()) for axis in changing_tilt) > LEVEL_BELOW
     # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
     is_observable = is_tilting and fast.bend_gain > LEAST_OF_BEND
-    circular = _noise_in_reference(seen, fast)
+    circular = _noise_in_reference(samples, fast)
     return ResidualTrend(
         tilt=tilt, tilt_std=tilt_std, bias=means.bias.x[-3:], bias_std=means.bias.std[-3:],
         smoothed=float(fast.fit.x[-1] / fast.bend_gain) if is_observable else 0.0,
         smoothed_std=float(fast.fit.std[-1] / fast.bend_gain) if is_observable else math.inf,
         lean=np.array([roll.mean(), pitch.mean()]), speed=math.sqrt(float((velocity**2).sum(axis=1).mean())),
         circular=circular.share, circular_std=circular.std, circular_s=circular.memory_s,
-        over_ground=_over_ground(seen, means.bed), over_ground_std=means.bed.std[OVER_GROUND],
+        over_ground=_over_ground(samples, means.bed), over_ground_std=means.bed.std[OVER_GROUND],
         turned=float(means.bias.x[-4]), turned_std=float(means.bias.std[-4]),
     )  # fmt: skip
 
@@ -193,12 +197,12 @@ class _SmoothedMotion(NamedTuple):
     bend: Array
 
 
-def _smoothed_motion(seen: _ResidualSamples) -> _SmoothedMotion:
+def _smoothed_motion(samples: _ResidualSamples) -> _SmoothedMotion:
     """Smooth the DVL's velocity over BEND_S, and differentiate it over the same time."""
-    time, body_from_enu = seen.time, seen.rotation_enu_from_body.swapaxes(1, 2)
-    enu = _mean(time, _turned(seen.rotation_enu_from_body, seen.dvl), BEND_S)
+    time, body_from_enu = samples.time, samples.rotation_enu_from_body.swapaxes(1, 2)
+    enu = _mean(time, _turned(samples.rotation_enu_from_body, samples.dvl), BEND_S)
     slope = (linear_at(time, enu, time + BEND_S) - linear_at(time, enu, time - BEND_S)) / (2.0 * BEND_S)
-    return _SmoothedMotion(*(_turned(body_from_enu, each) for each in (enu, slope, _bend(time, enu))))
+    return _SmoothedMotion(*(_turned(body_from_enu, values) for values in (enu, slope, _bend(time, enu))))
 
 
 def _bend(time: Array, values: Array) -> Array:
@@ -224,21 +228,21 @@ class _FastFit(NamedTuple):
 
 
 def _fit_fast_signals(
-    seen: _ResidualSamples, smoothed: _SmoothedMotion, changing_tilt: Sequence[Array]
+    samples: _ResidualSamples, smoothed: _SmoothedMotion, changing_tilt: Sequence[Array]
 ) -> _FastFit | None:
     """Fit roll, pitch (N,) rad and the second derivative of the velocity to all samples; None for too little data."""
-    time, body_from_enu = seen.time, seen.rotation_enu_from_body.swapaxes(1, 2)
+    time, body_from_enu = samples.time, samples.rotation_enu_from_body.swapaxes(1, 2)
     signals = np.zeros((len(time), 3, 3))
     for axis, tilt in enumerate(changing_tilt):
         tilt_axis = np.zeros((len(time), 3))
         tilt_axis[:, axis] = -tilt
         signals[:, :, axis] = cross(tilt_axis, smoothed.velocity)
     # second derivative of means, so that DVL noise is common to all samples of a mean
-    of_means = _mean(time, _turned(seen.rotation_enu_from_body, _mean(time, seen.dvl, MEAN_S)), BEND_S)
+    of_means = _mean(time, _turned(samples.rotation_enu_from_body, _mean(time, samples.dvl, MEAN_S)), BEND_S)
     signals[:, :, 2] = _turned(body_from_enu, _bend(time, of_means))
     # linear interpolation loses this part of the second derivative on average
-    residual = seen.error - seen.interval_s**2 / 12.0 * smoothed.bend
-    nuisance = _nuisance_columns(smoothed.velocity, seen.rates, smoothed.slope, body_from_enu)
+    residual = samples.error - samples.interval_s**2 / 12.0 * smoothed.bend
+    nuisance = _nuisance_columns(smoothed.velocity, samples.rates, smoothed.slope, body_from_enu)
     columns = np.concatenate([nuisance, signals], axis=2)
     fit = _fitted(time, columns, residual, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
     return None if fit is None else _FastFit(fit, columns, fit.last_coefficient(columns, smoothed.bend))
@@ -251,19 +255,19 @@ class _MeanFits(NamedTuple):
     bed: _Fit
 
 
-def _fit_means(seen: _ResidualSamples, smoothed: _SmoothedMotion) -> _MeanFits | None:
+def _fit_means(samples: _ResidualSamples, smoothed: _SmoothedMotion) -> _MeanFits | None:
     """Fit bias, heading errors and moving bed to means over MEAN_S; None for too little data."""
-    time, rotation = seen.time, seen.rotation_enu_from_body
+    time, rotation = samples.time, samples.rotation_enu_from_body
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
     moving = _neighbouring_means(time, smoothed.velocity, starts)
-    nuisance = _nuisance_columns(moving, seen.rates, smoothed.slope, rotation.swapaxes(1, 2))
+    nuisance = _nuisance_columns(moving, samples.rates, smoothed.slope, rotation.swapaxes(1, 2))
     progress = (time - time.mean()) / (time[-1] - time[0])
     heading_terms = np.column_stack([heading_cycles(rotation), progress])
     by_heading = nuisance[:, :, -1, None] * heading_terms[:, None]
     by_bias = np.broadcast_to(-np.eye(3), (len(time), 3, 3))
-    columns = np.concatenate([_means(each, starts) for each in (nuisance, by_heading, by_bias)], axis=2)
-    data = _means(time, starts), columns, _means(seen.error, starts)
+    columns = np.concatenate([_means(part, starts) for part in (nuisance, by_heading, by_bias)], axis=2)
+    data = _means(time, starts), columns, _means(samples.error, starts)
     prior_std = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
     bias = _fitted(*data, prior_std, LASTING)
     prior_std[OVER_GROUND] = BED_STD_MPS
@@ -271,13 +275,13 @@ def _fit_means(seen: _ResidualSamples, smoothed: _SmoothedMotion) -> _MeanFits |
     return None if bias is None or bed is None else _MeanFits(bias, bed)
 
 
-def _over_ground(seen: _ResidualSamples, bed: _Fit) -> Array:
+def _over_ground(samples: _ResidualSamples, bed: _Fit) -> Array:
     """Return the velocity (2,) m/s of the bed, east and north; 0 if the residual holds less than half of it.
 
     On few headings yaw and bias can compensate any bed velocity, with a small residual.
     """
     over_ground = bed.x[OVER_GROUND]
-    residual = median(_turned(seen.rotation_enu_from_body, seen.error)[:, :2])
+    residual = median(_turned(samples.rotation_enu_from_body, samples.error)[:, :2])
     if float(over_ground @ residual) < 0.5 * float(over_ground @ over_ground):
         return np.zeros(2)
     return over_ground
@@ -315,25 +319,25 @@ def confused_with_bias_std(estimate: Estimate, parameters: Parameters) -> Array:
     return np.sqrt([float(weights @ p[3:, 3:] @ weights), angles[2], angles[1]])
 
 
-def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None:
+def moving_bed(trend: ResidualTrend | None, estimate: Estimate) -> Reason | None:
     """Return the reason against a calibration over a moving bed; None if not significant.
 
     It is only marginal if the calibration's constant reference error holds most of that velocity.
     """
-    if found is None:
+    if trend is None:
         return None
-    size = float(np.linalg.norm(found.over_ground))
-    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < Z_SLOW_ERRORS * found.over_ground_std).all():
+    size = float(np.linalg.norm(trend.over_ground))
+    if size < MOVES_FROM_MPS or (np.abs(trend.over_ground) < Z_SLOW_ERRORS * trend.over_ground_std).all():
         return None
     estimated_error = [estimate.state_of(name) for name in OFFSETS]
-    is_held = float(np.linalg.norm(found.over_ground - estimated_error)) < 0.5 * size
-    course = math.degrees(math.atan2(*found.over_ground)) % 360.0
+    is_held = float(np.linalg.norm(trend.over_ground - estimated_error)) < 0.5 * size
+    course = math.degrees(math.atan2(*trend.over_ground)) % 360.0
     reason = finding("BED_MOVES", millimetres=1000.0 * size, course=course, std=float(f"{size:.1g}"))
     return reason.weighed(Severity.MARGINAL if is_held else Severity.REJECT)
 
 
 def residual_warnings(
-    found: ResidualTrend | None,
+    trend: ResidualTrend | None,
     of_positions: bool = False,
     mounting_std: Sequence[float] | Array = (0.0, 0.0, 0.0),
     beam: BeamFault | None = None,
@@ -342,41 +346,42 @@ def residual_warnings(
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
-    of_positions: the reference's velocities are position differences, smoothed by their interval. mounting_std: see
-    `confused_with_bias_std`. accepted: error of the mounting (rad, or share of the distance) that does not reject a
-    calibration; nor does an error within its own 95 % interval.
+    of_positions: the reference's velocities are position differences, smoothed by their interval.
+    mounting_std: see `confused_with_bias_std`.
+    accepted: error of the mounting (rad, or share of the distance) that does not reject a calibration; nor does an
+      error within its own 95 % interval.
     second_order: square of the misalignment, rad²: the error of its first-order model, which looks like a beam.
     """
-    if found is None:
+    if trend is None:
         return []
-    seconds = math.sqrt(2.0 * abs(found.smoothed))
+    seconds = math.sqrt(2.0 * abs(trend.smoothed))
     # a filter smooths and passes noise on: with evidence for one, the other needs less
-    is_filter = not of_positions and found.smoothed > Z_95_PERCENT * found.smoothed_std
-    if found.circular > (Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std:
-        return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
-    by_position_window = of_positions and found.smoothed > 0.0
-    is_smoothed = abs(found.smoothed) > Z_REPEATED_TEST * found.smoothed_std
+    is_filter = not of_positions and trend.smoothed > Z_95_PERCENT * trend.smoothed_std
+    if trend.circular > (Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * trend.circular_std:
+        return [finding("CIRCULAR_REFERENCE", seconds=trend.circular_s).weighed(Severity.REJECT)]
+    by_position_window = of_positions and trend.smoothed > 0.0
+    is_smoothed = abs(trend.smoothed) > Z_REPEATED_TEST * trend.smoothed_std
     if is_smoothed and seconds > TOO_SMOOTH_S:
         severity = Severity.MARGINAL if by_position_window else Severity.REJECT
         # smoothing causes any other signal
-        return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(severity)]
-    reasons = _tilt_warnings(found, accepted)
+        return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(trend), seconds=seconds).weighed(severity)]
+    reasons = _tilt_warnings(trend, accepted)
     # the heading at either end, relative to its mean
-    error = 0.5 * abs(found.turned)
-    if error > REPORTED_FROM_RAD and error > Z_ONE_TEST * found.turned_std:
+    error = 0.5 * abs(trend.turned)
+    if error > REPORTED_FROM_RAD and error > Z_ONE_TEST * trend.turned_std:
         severity = Severity.MARGINAL if error > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
-        degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
+        degrees = {"degrees": math.degrees(trend.turned), "std": math.degrees(trend.turned_std)}
         reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(error)).weighed(severity))
-    if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
+    if all(reason.severity is Severity.WARNING for reason in reasons):  # a wrong tilt or heading looks like a beam
         reasons += beam_warning(beam, max(accepted, second_order))
-    return reasons + _bias_warnings(found, mounting_std, accepted)
+    return reasons + _bias_warnings(trend, mounting_std, accepted)
 
 
-def _tilt_warnings(found: ResidualTrend, accepted: float) -> list[Reason]:
+def _tilt_warnings(trend: ResidualTrend, accepted: float) -> list[Reason]:
     """Return reasons for roll and pitch that the DVL's velocity does not follow, or may not. accepted: rad."""
     reasons = []
     for axis, name in enumerate(("roll", "pitch")):
-        share, std, lean = float(found.tilt[axis]), float(found.tilt_std[axis]), float(found.lean[axis])
+        share, std, lean = float(trend.tilt[axis]), float(trend.tilt_std[axis]), float(trend.lean[axis])
         if abs(share) > max(Z_SLOW_ERRORS * std, MISSING_TILT_SHARE):
             error = abs(share * lean)
             severity = Severity.REJECT if error > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
@@ -387,29 +392,29 @@ def _tilt_warnings(found: ResidualTrend, accepted: float) -> list[Reason]:
     return reasons
 
 
-def _bias_warnings(found: ResidualTrend, mounting_std: Sequence[float] | Array, accepted: float) -> list[Reason]:
+def _bias_warnings(trend: ResidualTrend, mounting_std: Sequence[float] | Array, accepted: float) -> list[Reason]:
     """Return the reason for a significant bias, or for one speed that does not show it; see `residual_warnings`."""
-    magnitude = np.abs(found.bias)
-    is_significant = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
+    magnitude = np.abs(trend.bias)
+    is_significant = (magnitude > Z_FIFTY_TESTS * trend.bias_std) & (magnitude > REPORTED_FROM_RAD * trend.speed)
     if is_significant.any():
         axes = ", ".join(
-            f"{axis} {1000.0 * found.bias[i]:+.0f} ± {1000.0 * found.bias_std[i]:.0f}"
+            f"{axis} {1000.0 * trend.bias[i]:+.0f} ± {1000.0 * trend.bias_std[i]:.0f}"
             for i, axis in enumerate("xyz")
             if is_significant[i]
         )
-        angle = float(magnitude[is_significant].max()) / found.speed
-        allowed_mps = np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * found.speed
-        is_wrong = is_significant & (magnitude - found.bias_std > allowed_mps)
+        angle = float(magnitude[is_significant].max()) / trend.speed
+        allowed_mps = np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * trend.speed
+        is_wrong = is_significant & (magnitude - trend.bias_std > allowed_mps)
         severity = Severity.REJECT if is_wrong.any() else Severity.MARGINAL
         return [finding("DVL_BIAS", axes=axes, degrees=math.degrees(angle)).weighed(severity)]
-    if float(found.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
-        share = TYPICAL_BIAS_MPS / found.speed
+    if float(trend.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
+        share = TYPICAL_BIAS_MPS / trend.speed
         return [finding("ONE_SPEED", off=TYPICAL_BIAS_MPS, degrees=math.degrees(share), percent=100.0 * share)]
     return []
 
 
-def _smoothed_one(found: ResidualTrend) -> str:
-    return "reference" if found.smoothed > 0.0 else "DVL"
+def _smoothed_one(trend: ResidualTrend) -> str:
+    return "reference" if trend.smoothed > 0.0 else "DVL"
 
 
 def _fitted(
@@ -434,8 +439,8 @@ def _fitted(
         residual = error - columns @ estimate
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, residual), starts, axis=0)
     # one axis at a time to save memory: hours of data would need a tenth of a gigabyte
-    each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
-    contributions = np.sum(each_axis, axis=0)
+    axis_sums = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
+    contributions = np.sum(axis_sums, axis=0)
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
     prior_error = p[:, : len(NUISANCE_STD)] * (prior * prior_std)[: len(NUISANCE_STD)]
     std = student_factor(effective_blocks(contributions[None])[0] - 1.0) * _std(p @ scores.T, group_sizes)
@@ -446,7 +451,7 @@ def _std(scatter: Array, group_sizes: Sequence[int]) -> Array:
     """Return the largest σ (n,) from scatter (n, M) of stretches and of their groups, as noise is correlated."""
     n, m = scatter.shape
     sums = [scatter[:, : m // k * k].reshape(n, -1, k).sum(axis=2) for k in group_sizes if m >= 2 * k]
-    return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
+    return np.sqrt(np.max([(group**2).sum(axis=1) for group in sums], axis=0) * (m / (m - 1.0)))
 
 
 class _KeptNoise(NamedTuple):
@@ -460,24 +465,24 @@ class _KeptNoise(NamedTuple):
 _NO_KEPT_NOISE = _KeptNoise(0.0, math.inf, 0.0)
 
 
-def _noise_in_reference(seen: _ResidualSamples, fast: _FastFit) -> _KeptNoise:
+def _noise_in_reference(samples: _ResidualSamples, fast: _FastFit) -> _KeptNoise:
     """Estimate the share of the DVL's noise in the reference, for the most significant memory of a filter.
 
     The innovation of a velocity, given its neighbours, holds its noise. The same filter is applied to the residual, so
     both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
-    step = float(median(np.diff(seen.time)))
+    step = float(median(np.diff(samples.time)))
     # in slower streams the innovation is motion, and a reference that is interpolated follows the motion before
-    if max(step, seen.interval_s) > SLOWEST_S or len(seen.time) < 4 * NEIGHBOURS:
+    if max(step, samples.interval_s) > SLOWEST_S or len(samples.time) < 4 * NEIGHBOURS:
         return _NO_KEPT_NOISE
-    innovation, kept = (np.zeros_like(seen.dvl) for _ in range(2))
-    for axis, values in enumerate((seen.dvl - seen.dvl.mean(axis=0)).T):
+    innovation, kept = (np.zeros_like(samples.dvl) for _ in range(2))
+    for axis, values in enumerate((samples.dvl - samples.dvl.mean(axis=0)).T):
         shares = _innovation_filter(values)
-        for filtered, each in ((innovation, values), (kept, seen.error[:, axis])):
-            filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
+        for filtered, unfiltered in ((innovation, values), (kept, samples.error[:, axis])):
+            filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(unfiltered, shares, "valid")
     limit = OUTLIER_RATIO * robust_std(innovation)
     # gaps break the prediction
-    is_gap = np.append(0.0, np.abs(np.diff(seen.time) - step) > 0.5 * step)
+    is_gap = np.append(0.0, np.abs(np.diff(samples.time) - step) > 0.5 * step)
     innovation[np.convolve(is_gap, np.ones(2 * NEIGHBOURS), "same") > 0.5] = 0.0
     noise = np.clip(innovation, -limit, limit)
     weight = fast.fit.weight * ((innovation == noise) & (innovation != 0.0)).all(axis=1)  # neither clipped, nor an end
@@ -500,7 +505,7 @@ def _noise_in_reference(seen: _ResidualSamples, fast: _FastFit) -> _KeptNoise:
             std = math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES)
             if share - Z_95_PERCENT * std < 1.0:  # no filter makes more of the noise than there is: that is motion
                 candidates.append(_KeptNoise(share, std, seconds))
-    return max(candidates, key=lambda each: each.share / each.std, default=_NO_KEPT_NOISE)
+    return max(candidates, key=lambda kept_noise: kept_noise.share / kept_noise.std, default=_NO_KEPT_NOISE)
 
 
 def _filtered_noise(noise: Array, step: float, seconds: float, corrected_lag: float) -> Array:
@@ -508,7 +513,7 @@ def _filtered_noise(noise: Array, step: float, seconds: float, corrected_lag: fl
     kernel = np.exp(-np.arange(math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
     n_ahead = int(corrected_lag / step + 1e-6)
     kernel[n_ahead] = 0.0
-    output = np.column_stack([np.convolve(np.append(each, np.zeros(n_ahead)), kernel) for each in noise.T])
+    output = np.column_stack([np.convolve(np.append(column, np.zeros(n_ahead)), kernel) for column in noise.T])
     return np.asarray(output[n_ahead : n_ahead + len(noise)])
 
 

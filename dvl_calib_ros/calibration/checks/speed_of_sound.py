@@ -56,8 +56,12 @@ class Between(NamedTuple):
 class Water:
     """Water properties from a recording, nan if not recorded.
 
-    temperature: °C. temperature_error: half of its range, °C. salinity: PSU, measured. depth: m. used: speed of sound
-    set in the DVL, m/s. source: topic of the temperature.
+    temperature: °C.
+    temperature_error: half of its range, °C.
+    salinity: PSU, measured.
+    depth: m.
+    used: speed of sound set in the DVL, m/s.
+    source: topic of the temperature.
     """
 
     temperature: float = math.nan
@@ -92,8 +96,8 @@ class Water:
     def salinities(self, speed: Between) -> Between:
         """Return the range of natural salinities that give this speed of sound at this temperature."""
         least, most = (
-            35.0 + (each - _of_salinity_35(at, self.depth)) / _by_salinity(at)
-            for each, at in (
+            35.0 + (sound_speed - _of_salinity_35(celsius, self.depth)) / _by_salinity(celsius)
+            for sound_speed, celsius in (
                 (speed.least, self.temperature + self.temperature_error),
                 (speed.most, self.temperature - self.temperature_error),
             )
@@ -109,23 +113,24 @@ def water_document(water: Water) -> dict[str, Any]:
     """Return plain data, with None if unknown; ranges are [least, most]."""
     ranges = {"speed_of_sound": water.speed, "scale_explained": water.scale}
     return {
-        **{_KEYS.get(name, name): None if each != each else each for name, each in asdict(water).items()},
-        **{name: None if each is None else list(each) for name, each in ranges.items()},
+        **{_KEYS.get(name, name): None if value != value else value for name, value in asdict(water).items()},
+        **{name: None if between is None else list(between) for name, between in ranges.items()},
     }
 
 
 def water_of_document(document: Mapping[str, Any]) -> Water:
     """Read the output of `water_document`. Raise LookupError, TypeError or ValueError if it is invalid."""
-    values = {each.name: document[_KEYS.get(each.name, each.name)] for each in fields(Water)}
+    values = {column.name: document[_KEYS.get(column.name, column.name)] for column in fields(Water)}
     source = str(values.pop("source"))
-    return Water(**{name: math.nan if each is None else float(each) for name, each in values.items()}, source=source)
+    return Water(**{name: math.nan if value is None else float(value) for name, value in values.items()}, source=source)
 
 
 class CauseOfScale(NamedTuple):
     """Cause of a scale error.
 
-    sentence: in full. brief: one terminal line after the words "speed of sound". setting: speed of sound to set, m/s;
-    nan without a recommendation.
+    sentence: in full.
+    brief: one terminal line after the words "speed of sound".
+    setting: speed of sound to set, m/s; nan without a recommendation.
     """
 
     sentence: str
@@ -141,7 +146,7 @@ def cause_of_scale(
     state: of a model, x (n,), P (n, n) of this recording, without day-to-day variation.
     """
     scale = scale_and_delay(model, state, parameters)
-    is_shown = all(each.observed for each in observability(model, state.p, parameters) if each.axis == "scale")
+    is_shown = all(entry.observed for entry in observability(model, state.p, parameters) if entry.axis == "scale")
     if scale.scale_std is None or not is_shown:
         return cause_of_setting(water)
     return cause(water, scale.scale, scale.scale_std)
@@ -178,7 +183,7 @@ def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
             right_setting,
         )
     if explained is None:
-        was = [each * (1.0 + end) for each, end in zip(speed, measured, strict=True)]
+        was = [limit * (1.0 + end) for limit, end in zip(speed, measured, strict=True)]
         return CauseOfScale(
             f"{text}. The speed of sound explains the scale if the DVL was set to {was[0]:.0f} to {was[1]:.0f} m/s.",
             f"{speed.least:.1f} to {speed.most:.1f} m/s here; what the DVL used is not known",

@@ -95,9 +95,7 @@ class Difference:
     def p(self) -> Array:
         """(8,) two-sided p-values with Holm's correction, nan if not compared."""
         found = np.full(N_COMPONENTS, np.nan)
-        found[self.compared] = holm(
-            [chi2_sf(each, 1) for each in ((self.value / self.std) ** 2)[self.compared].tolist()]
-        )
+        found[self.compared] = holm([chi2_sf(z2, 1) for z2 in ((self.value / self.std) ** 2)[self.compared].tolist()])
         return found
 
     def chance(self, components: NDArray[np.intp] = _ALL) -> float:
@@ -187,7 +185,7 @@ class Comparison(Answering):
     def contradicting(self) -> tuple[Change, ...]:
         """Changes of the mounting at 1 %, across which an average would be no calibration's mounting."""
         level = CHANCE / (len(self.calibrations) - 1)
-        return tuple(each for each in (*self.moved, *self.suspicious) if each.difference.chance(MOUNTING) < level)
+        return tuple(move for move in (*self.moved, *self.suspicious) if move.difference.chance(MOUNTING) < level)
 
     @property
     def same_mounting(self) -> bool:
@@ -195,16 +193,16 @@ class Comparison(Answering):
         return self.verdict == "same"
 
 
-def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
+def contradicts(result: Extrinsics, initial: Extrinsics) -> Difference | None:
     """Return the difference of an initial calibration from another at 1 %; None if they agree."""
-    difference = Difference.between(initial, found)
+    difference = Difference.between(initial, result)
     return difference if difference.chance(MOUNTING) < CHANCE else None
 
 
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
     """Raise InputError for a calibration that is given twice: its differences would be zero."""
     for one, other in combinations(calibrations, 2):
-        identity, other_identity = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
+        identity, other_identity = ((c.model, c.first_ns, c.last_ns, c.used) for c in (one, other))
         if identity == other_identity and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
             raise InputError(
                 f"{one.name}, {other.name}: are the same calibration, which cannot be compared with itself"
@@ -220,15 +218,15 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
     if len(calibrations) < 2:
         name = calibrations[0].name if calibrations else "nothing"
         raise InputError(f"{name}: one alone cannot be compared; name two")
-    ordered = sorted(calibrations, key=lambda each: each.first_ns)  # stable for equal stamps
-    ordered = [replace(each, value=_near(each.value, ordered[0].value)) for each in ordered]
+    ordered = sorted(calibrations, key=lambda one: one.first_ns)  # stable for equal stamps
+    ordered = [replace(calibration, value=_near(calibration.value, ordered[0].value)) for calibration in ordered]
     pairs = [Difference.between(*two) for two in combinations(ordered, 2)]
     if not any(pair.compared[MOUNTING].any() for pair in pairs):
         raise InputError(
-            f"{', '.join(each.name for each in ordered)}: no angle is observable in two of them, so there is nothing "
-            "to compare; calibrate on more data (dvl-calib doctor says what is missing)"
+            f"{', '.join(calibration.name for calibration in ordered)}: no angle is observable in two of them, so "
+            "there is nothing to compare; calibrate on more data (dvl-calib doctor says what is missing)"
         )
-    accepted = [each for each in ordered if not each.rejected]
+    accepted = [calibration for calibration in ordered if not calibration.rejected]
     series = accepted or ordered
     instants = max(len(series) - 1, 1)
     together = cache(fused)
@@ -239,7 +237,7 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
         pairs=tuple(pairs),
         moved=tuple(moved),
         suspicious=tuple(change for change in changes if change not in moved),
-        suspected=tuple(_suspected(series, [each for each in ordered if each not in series])),
+        suspected=tuple(_suspected(series, [calibration for calibration in ordered if calibration not in series])),
         scale_changed=tuple(_changes(series, ONLY_SCALE, CHANCE / instants, together)),
         clock_changed=tuple(_changes(series, ONLY_CLOCK, CHANCE / instants, together)),
         scatter=_scatter(series, [change.first_after for change in changes], together),
@@ -257,15 +255,16 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     if len(several) == 1:
         return several[0]
     base = several[0]
-    if any(not each.dvl or each.dvl != base.dvl for each in several):
-        several = [replace(each, dvl="", by_bias=np.zeros_like(each.by_bias)) for each in several]
-    observable = np.any([each.shown for each in several], axis=0)
-    values = np.array([_near(each.value, base.value) for each in several])
+    if any(not calibration.dvl or calibration.dvl != base.dvl for calibration in several):
+        several = [replace(calibration, dvl="", by_bias=np.zeros_like(calibration.by_bias)) for calibration in several]
+    observable = np.any([calibration.shown for calibration in several], axis=0)
+    values = np.array([_near(calibration.value, base.value) for calibration in several])
     value, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: value of the first
     covariance = np.zeros((N_COMPONENTS, N_COMPONENTS))
-    own, by_biases = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
-    information, vector = own.sum(axis=0), np.einsum("nij,nj->i", own, values)
-    bias_information = own @ by_biases
+    informations = np.array([calibration.information for calibration in several])
+    by_biases = np.array([calibration.by_bias for calibration in several])
+    information, vector = informations.sum(axis=0), np.einsum("nij,nj->i", informations, values)
+    bias_information = informations @ by_biases
     for index in (group[observable[group]] for group in GROUPS):
         # bias of σ 1 as an additional state
         cross_information = bias_information[:, index].sum(axis=0)
@@ -278,14 +277,14 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     return replace(
         base,
         name=f"{len(several)} together",
-        model=" ".join(dict.fromkeys(each.model for each in several)),
-        last_ns=max(each.last_ns for each in several),
+        model=" ".join(dict.fromkeys(calibration.model for calibration in several)),
+        last_ns=max(calibration.last_ns for calibration in several),
         value=value,
         covariance=covariance + by_bias @ by_bias.T,
         shown=observable,
         dvl=several[0].dvl,
         by_bias=by_bias,
-        used=sum(each.used for each in several),
+        used=sum(calibration.used for calibration in several),
         remarks=(),
     )
 
@@ -325,29 +324,29 @@ def _changes(
 def _suspected(series: Sequence[Extrinsics], rejected: Sequence[Extrinsics]) -> list[Change]:
     """Compare each rejected calibration with the accepted one nearest in stamps."""
     found = []
-    for each in rejected:
-        nearest = min(series, key=lambda other: abs(other.first_ns - each.first_ns))
-        first, second = sorted((nearest, each), key=lambda calibration: calibration.first_ns)
+    for doubted in rejected:
+        nearest = min(series, key=lambda other: abs(other.first_ns - doubted.first_ns))
+        first, second = sorted((nearest, doubted), key=lambda calibration: calibration.first_ns)
         found.append(Change(Difference.between(first, second), first, second))
-    return [each for each in found if each.difference.chance(MOUNTING) < SUSPICIOUS / len(rejected)]
+    return [move for move in found if move.difference.chance(MOUNTING) < SUSPICIOUS / len(rejected)]
 
 
 def _smallest(differences: Sequence[Difference]) -> Array:
     """Return the movement (3,) rad of each angle that is found with `POWER` in the least certain difference."""
     found = np.full(N_AXES, np.nan)
-    for each in differences:
-        level = SUSPICIOUS / (len(differences) * max(int(each.compared.sum()), 1))
-        found = np.fmax(found, smallest_found(level, POWER) * each.std[ANGLES])
+    for difference in differences:
+        level = SUSPICIOUS / (len(differences) * max(int(difference.compared.sum()), 1))
+        found = np.fmax(found, smallest_found(level, POWER) * difference.std[ANGLES])
     return found
 
 
 def _scatter(series: Sequence[Extrinsics], starts: Sequence[Extrinsics], together: _Together) -> ChiSquare:
     """Test the mountings about the mean of each stretch that begins at one of `starts`."""
     total, freedom, begin = 0.0, 0, 0
-    for k, each in enumerate(series):
-        begin = k if each in starts else begin
+    for k, calibration in enumerate(series):
+        begin = k if calibration in starts else begin
         if k > begin:  # each against those before it: independent terms, the same sum
-            test = Difference.between(together(tuple(series[begin:k])), each).chi_square(MOUNTING)
+            test = Difference.between(together(tuple(series[begin:k])), calibration).chi_square(MOUNTING)
             total, freedom = total + test.value, freedom + test.freedom
     return ChiSquare(total, freedom, chi2_sf(total, freedom) if freedom else math.nan)
 
@@ -360,7 +359,7 @@ _ANGLE_NAMES = COMPONENTS[ANGLES]
 def reasons(comparison: Comparison) -> list[Reason]:
     """Return the findings, the mounting first."""
     findings = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
-    findings = [*findings, *map(suspected, comparison.suspected)] or [_same(comparison)]
+    findings = [*findings, *map(suspected, comparison.suspected)] or [_no_movement(comparison)]
     findings += map(scale_changed, comparison.scale_changed)
     for change in comparison.clock_changed:
         seconds, std = float(change.difference.value[TIME_OFFSET]), float(change.difference.std[TIME_OFFSET])
@@ -373,7 +372,7 @@ def reasons(comparison: Comparison) -> list[Reason]:
     return findings
 
 
-def _same(comparison: Comparison) -> Reason:
+def _no_movement(comparison: Comparison) -> Reason:
     """Return the smallest movement that would be found, or that no single date explains the differences."""
     scatter = comparison.scatter
     if scatter.freedom and scatter.p < CHANCE:
@@ -381,8 +380,8 @@ def _same(comparison: Comparison) -> Reason:
         numbers = {"chi_square": scatter.value, "freedom": scatter.freedom, "p": scatter.p}
         return finding("MOUNTING_SCATTERS", count=len(comparison.calibrations), apart=math.degrees(change), **numbers)
     smallest = np.degrees(comparison.smallest)
-    found = [f"{name} {each:.1f}°" for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(each)]
-    not_compared = [name for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(each)]
+    found = [f"{name} {size:.1f}°" for name, size in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(size)]
+    not_compared = [name for name, size in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(size)]
     return finding(
         "MOUNTING_SAME",
         smallest=float(np.nanmax(smallest, initial=0.0)),
@@ -414,22 +413,22 @@ def suspected(change: Change) -> Reason:
 
 def scale_changed(change: Change) -> Reason:
     """Word a change of scale."""
-    percent, std = (100.0 * float(each[SCALE]) for each in (change.difference.value, change.difference.std))
+    percent, std = (100.0 * float(part[SCALE]) for part in (change.difference.value, change.difference.std))
     return finding("SCALE_CHANGED", percent=percent, std=std, between=between(change))
 
 
 def remarks(comparison: Comparison) -> list[Reason]:
     """Say what makes differences less reliable than their σ."""
     found = [
-        finding("CALIBRATION_DOUBTED", name=each.name, remark=remark)
-        for each in comparison.calibrations
-        for remark in each.remarks
+        finding("CALIBRATION_DOUBTED", name=calibration.name, remark=remark)
+        for calibration in comparison.calibrations
+        for remark in calibration.remarks
     ]
-    models = dict.fromkeys(each.model for each in comparison.calibrations)
+    models = dict.fromkeys(calibration.model for calibration in comparison.calibrations)
     if len(models) > 1:
         found.append(finding("MODELS_DIFFER", models=", ".join(models)))
-    assumed = [each for each in comparison.calibrations if not each.shown[LEVER_ARM].any()]
-    estimated = [each for each in comparison.calibrations if each.shown[LEVER_ARM].any()]
+    assumed = [calibration for calibration in comparison.calibrations if not calibration.shown[LEVER_ARM].any()]
+    estimated = [calibration for calibration in comparison.calibrations if calibration.shown[LEVER_ARM].any()]
     for each in assumed:
         for other in (*estimated, *assumed):
             gap = np.where(
@@ -468,15 +467,15 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     return {
         "verdict": comparison.word,
         "same_mounting": comparison.same_mounting,
-        "says": [each.full_sentence for each in findings],
-        "remarks": [str(each) for each in remarked],
-        "findings": [each.as_dict() for each in (*findings, *remarked)],
+        "says": [reason.full_sentence for reason in findings],
+        "remarks": [str(reason) for reason in remarked],
+        "findings": [reason.as_dict() for reason in (*findings, *remarked)],
         "calibrations": [
-            {name: getattr(each, name) for name in ("name", "model", "first_ns", "last_ns", "used", "rejected")}
-            | {"value": _named(each.value), "std": _named(each.std)}
-            for each in comparison.calibrations
+            {name: getattr(calibration, name) for name in ("name", "model", "first_ns", "last_ns", "used", "rejected")}
+            | {"value": _named(calibration.value), "std": _named(calibration.std)}
+            for calibration in comparison.calibrations
         ],
-        "pairs": [_difference_document(each) for each in comparison.pairs],
+        "pairs": [_difference_document(pair) for pair in comparison.pairs],
         **{
             name: [
                 {"last_before": change.last_before.name, "first_after": change.first_after.name}

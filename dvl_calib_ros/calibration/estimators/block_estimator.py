@@ -65,17 +65,17 @@ class _PendingDvl(RowTable):
 class FullEstimator(Estimator):
     """Estimator of `full`, which feeds a `BlockSolver` and tells the aligner which data it still needs."""
 
-    def __init__(self, given: EstimatorSetup) -> None:
+    def __init__(self, setup: EstimatorSetup) -> None:
         """Start from the prior of the states."""
-        model, parameters, aligner = given.model, given.parameters, given.aligner
+        model, parameters, aligner = setup.model, setup.parameters, setup.aligner
         self._parameters = parameters
         self._aligner = aligner
-        self._on_block = given.on_evidence
+        self._on_block = setup.on_evidence
         self._unknown = prior(model, parameters)
-        self._prior = given.initial or self._unknown
-        is_live = given.worker is not None
-        self._solver = BlockSolver(parameters, self._prior, self._unknown, given.verified, live=is_live)
-        self._worker = AtOnce() if given.worker is None else given.worker
+        self._prior = setup.initial or self._unknown
+        is_live = setup.worker is not None
+        self._solver = BlockSolver(parameters, self._prior, self._unknown, setup.verified, live=is_live)
+        self._worker = AtOnce() if setup.worker is None else setup.worker
         # a block is complete after its margin, the longest lag of a stream, and the IMU's timeout
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._dvl = _PendingDvl()
@@ -85,7 +85,7 @@ class FullEstimator(Estimator):
         self._day_starts_ns: list[int] = []  # start of the first block of each day after the first
         self._last_result = self._solver.outcome()
         self._n_updates = 0
-        self._together = given.together
+        self._together = setup.together
         self._gathered: list[Block] = []
         # blocks being solved: stamp of effect, result, index in the result
         self._coming: deque[tuple[int, Future[list[Outcome]], int]] = deque()
@@ -152,7 +152,7 @@ class FullEstimator(Estimator):
         covariance: Array = np.zeros((N_STATE, N_STATE))
         if not self.claims:
             return covariance
-        registration = self._solver.registration() if self._is_settled else self._result_in_effect.looked.registration
+        registration = self._solver.registration() if self._is_settled else self._result_in_effect.clocks.registration
         if registration is not None:
             states_from_open = np.eye(len(_OPEN))
             # rotation and misalignment have opposite signs
@@ -209,12 +209,12 @@ class FullEstimator(Estimator):
 
     def residuals(self, *, fresh: bool) -> Residuals | None:
         """See `Estimator`."""
-        return self._idle_solver().residuals() if fresh else self._result_in_effect.looked.residuals
+        return self._idle_solver().residuals() if fresh else self._result_in_effect.clocks.residuals
 
     @property
     def registration_so_far(self) -> Registration | None:
         """Registration by the newest result in effect."""
-        return self._result_in_effect.looked.registration
+        return self._result_in_effect.clocks.registration
 
     @property
     def suggestion_so_far(self) -> Reason | None:

@@ -28,9 +28,13 @@ LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 class Cleaned(NamedTuple):
     """Samples of a block, without outliers.
 
-    raw: its references (J,) from the messages, thinned. reference: without outliers, with their stamps reference_ns.
-    dvl: without outliers. binned_dvl: for interpolation. noise_dvl: (3, 3) (m/s)², mean covariance. reference_spikes,
-    dvl_spikes: number of outliers within the block. own_dvl, own_imu: the block's own samples, without margins.
+    raw: its references (J,) from the messages, thinned.
+    reference: without outliers, with their stamps reference_ns.
+    dvl: without outliers.
+    binned_dvl: for interpolation.
+    noise_dvl: (3, 3) (m/s)², mean covariance.
+    reference_spikes, dvl_spikes: number of outliers within the block.
+    own_dvl, own_imu: the block's own samples, without margins.
     are_compared: whether it has references and DVL data for them; else DVL and IMU are empty.
     """
 
@@ -55,7 +59,7 @@ def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
         around, imu = block.reference, _imu(block.imu, epoch_ns)
         velocity = of_moments(seconds(around.stamps_ns, epoch_ns), around.values[:, :3], imu, parameters)
         block = block._replace(reference=around._replace(values=np.hstack([velocity, around.values[:, 3:]])))
-    own = _own(block)
+    own = _own_references(block)
     raw = block.reference.part(own)
     good = _good(block.reference.stamps_ns, _measured_velocity(block.reference))[own]
     reference = _reference(raw.part(np.flatnonzero(good)), parameters, epoch_ns)
@@ -131,7 +135,7 @@ def _reference(samples: ReferenceSamples, p: Parameters, epoch_ns: int) -> Refer
     return ReferenceColumns(seconds(stamps_ns, epoch_ns), velocity, noise, frames == _BODY, given)
 
 
-def _own(block: Block) -> Index:
+def _own_references(block: Block) -> Index:
     """Return indices of the block's references without margins, thinned."""
     stamps_ns = block.reference.stamps_ns
     start, end = np.searchsorted(stamps_ns, (block.from_ns, block.end_ns)).tolist()

@@ -36,7 +36,7 @@ from .block_preprocessing import Block, Cleaned, cleaned, seconds
 from .estimator import Residuals
 from .full_fit import JointFit
 from .full_forward_model import FitBlock, spline_slopes
-from .registration_schedule import FitSoFar, KeptClocks, Looked
+from .registration_schedule import FitSoFar, RegistrationResult, RegistrationSchedule
 
 # DVL and IMU are kept this far beyond a block, s: the longest delay, and the end of a spline.
 MARGIN_S = LONGEST_DELAY_S + 0.8
@@ -47,17 +47,19 @@ FEWEST_DVL = 6
 class Outcome(NamedTuple):
     """Results after a block.
 
-    days: states (20,) of `full` on each day; empty without an estimate. counts: samples used, outliers (spikes and
-    rejected residuals), and mean squared residual. claims: references with their own noise, minus those without.
-    has_rows: whether any reference has been used. looked: latest registration. suggestion: live, the configuration that
-    fits by it.
+    days: states (20,) of `full` on each day; empty without an estimate.
+    counts: samples used, outliers (spikes and rejected residuals), and mean squared residual.
+    claims: references with their own noise, minus those without.
+    has_rows: whether any reference has been used.
+    clocks: latest registration.
+    suggestion: live, the configuration that fits by it.
     """
 
     days: tuple[GaussianState, ...]
     counts: ModelCounts
     claims: int
     has_rows: bool
-    looked: Looked = Looked()
+    clocks: RegistrationResult = RegistrationResult()
     suggestion: Reason | None = None
 
 
@@ -72,8 +74,9 @@ class BlockSolver:
     ) -> None:
         """Start from priors; `FullEstimator` sets `epoch_ns`, the stamp of time 0.
 
-        prior: x, P of the states. unknown: prior of the per-day states on further days. live: repeat the registration
-        during the run.
+        prior: x, P of the states.
+        unknown: prior of the per-day states on further days.
+        live: repeat the registration during the run.
         """
         self._parameters = parameters
         self.fit = JointFit(parameters, prior, unknown)
@@ -83,10 +86,10 @@ class BlockSolver:
         self.speeds = np.zeros(2)
         self._seen_ahead = self._seen_upwards = False  # whether references measure these body axes
         self._dvl_stream = DvlStream()
-        self._turned = False
-        self._clocks = KeptClocks(parameters, live)
+        self._in_earth = False  # whether any reference is in an earth frame
+        self._clocks = RegistrationSchedule(parameters, live)
         self._is_live = live
-        self._claims = 0  # references
+        self._claims = 0  # references with their own noise, minus those without
         self._spikes = 0  # samples of DVL and reference
         self.epoch_ns = 0
         self.kept: list[ThinnedBlock] | None = [] if verified else None
@@ -105,20 +108,20 @@ class BlockSolver:
         """
         if own := self._dvl_stream.contradiction():
             return own
-        looked = self._clocks.looked(self._so_far, fresh=fresh)
-        contradiction, found = self._attitude_rates.contradiction(), looked.configuration
+        registered = self._clocks.latest(self._so_far, fresh=fresh)
+        contradiction, found = self._attitude_rates.contradiction(), registered.configuration
         if contradiction:  # a second contradiction is only reported if its correction also removes the first
             is_mended = found is not None and found.code in ("IMU_LOOKS_NED", "REFERENCE_OR_IMU_NED")
             return finding("TWO_CONTRADICTIONS", one=contradiction, other=found) if is_mended else contradiction
-        return found or self._shared_noise.contradiction() or self._clocks.contradiction(looked)
+        return found or self._shared_noise.contradiction() or self._clocks.contradiction(registered)
 
     def registration(self) -> Registration | None:
         """Return the registration of clocks and frames; None if the data do not determine it."""
-        return self._clocks.looked(self._so_far).registration
+        return self._clocks.latest(self._so_far).registration
 
     def residuals(self) -> Residuals | None:
         """Return the calibration's residuals, live only; else None."""
-        return self._clocks.looked(self._so_far).residuals
+        return self._clocks.latest(self._so_far).residuals
 
     @property
     def _so_far(self) -> FitSoFar | None:
@@ -127,7 +130,7 @@ class BlockSolver:
     @property
     def is_level(self) -> bool:
         """Return whether references are rotated into the body by a heading only, without roll and pitch."""
-        return self._turned and self._attitude_rates.is_level
+        return self._in_earth and self._attitude_rates.is_level
 
     @property
     def is_horizontal(self) -> bool:
@@ -138,11 +141,11 @@ class BlockSolver:
         """Solve blocks in order. Return the results after each."""
         outcomes = [self._solve(block) for block in blocks]
         if self._is_live:
-            self._clocks.look_again(self._so_far)
+            self._clocks.register_again(self._so_far)
             return_memory()
-        looked = self._clocks.looked(fresh=False)
+        registered = self._clocks.latest(fresh=False)
         suggestion = self.suggestion(fresh=False) if self._is_live else None
-        return [outcome._replace(looked=looked, suggestion=suggestion) for outcome in outcomes]
+        return [outcome._replace(clocks=registered, suggestion=suggestion) for outcome in outcomes]
 
     def _solve(self, block: Block) -> Outcome:
         """Check a block's samples and add them to the fit."""
@@ -155,7 +158,7 @@ class BlockSolver:
         if not streams.are_compared:
             return self.outcome()
         self._spikes += streams.dvl_spikes
-        self._look_at(streams)
+        self._check_instruments(streams)
         self.has_imu = self.has_imu or len(streams.imu.times) > 0
         if not self.has_imu and streams.reference.in_body.all():
             streams = streams._replace(imu=_as_if_still(streams.block, self.epoch_ns))
@@ -170,23 +173,21 @@ class BlockSolver:
             self.restarted += 1
         return self.outcome(self.fit.has_data)
 
-    def _look_at(self, streams: Cleaned) -> None:
-        """Give a block's samples to the checks of instruments and clocks, and keep them for verification."""
+    def _check_instruments(self, streams: Cleaned) -> None:
+        """Add a block's samples to the checks of instruments and clocks, and to the streams for verification."""
         block, reference, dvl, p = streams.block, streams.reference, streams.dvl, self._parameters
         rotation, oriented = attitude_at(streams.imu, reference.times, p.imu_timeout)
-        own = ImuColumns(*(column[streams.own_imu] for column in streams.imu))
-        self._attitude_rates.add(*own)
+        self._attitude_rates.add(*ImuColumns(*(column[streams.own_imu] for column in streams.imu)))
         self._compare_noise(streams, in_body(reference, rotation, oriented))
-        self._turned = self._turned or not reference.in_body.all()
+        self._in_earth = self._in_earth or not reference.in_body.all()
         stamps_ns = block.dvl.stamps_ns
         self._dvl_stream.add(block.dvl.velocity[(stamps_ns >= block.from_ns) & (stamps_ns < block.end_ns)])
-        claimed = int(np.count_nonzero(reference.claimed))
-        self._claims += claimed - (len(reference.times) - claimed)
+        self._claims += 2 * int(np.count_nonzero(reference.claimed)) - len(reference.times)
         from_s, to_s = seconds(np.array([block.from_ns, block.end_ns]), self.epoch_ns).tolist()
-        kept = ThinnedBlock.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
-        self._clocks.add(kept, streams.raw.frames, block.from_ns)
+        thinned = ThinnedBlock.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
+        self._clocks.add(thinned, streams.raw.frames, block.from_ns)
         if self.kept is not None:
-            self.kept.append(kept)
+            self.kept.append(thinned)
 
     def _fit_block(self, streams: Cleaned) -> FitBlock:
         """Return the part of a block that the fit keeps."""
@@ -197,19 +198,21 @@ class BlockSolver:
         dvl = DvlColumns(times[near].copy(), velocity[near].copy())
         imu = _thinned_imu(streams.imu, from_s - MARGIN_S, end_s + MARGIN_S)
         measured = np.diagonal(streams.reference.noise, axis1=1, axis2=2) < MEASURED_BELOW
-        folds = folds_of(streams.reference_ns, self._parameters)
-        slopes = spline_slopes(imu.times, np.hstack([imu.orientation, imu.angular_velocity]))
-        return FitBlock(from_s, end_s, dvl, spline_slopes(*dvl), imu, slopes, streams.reference, measured, folds)
+        imu_slope = spline_slopes(imu.times, np.hstack([imu.orientation, imu.angular_velocity]))
+        return FitBlock(
+            from_s, end_s, dvl, slope=spline_slopes(*dvl), imu=imu, imu_slope=imu_slope, reference=streams.reference,
+            measured=measured, fold=folds_of(streams.reference_ns, self._parameters),
+        )  # fmt: skip
 
-    def _compare_noise(self, streams: Cleaned, seen: InBody) -> None:
-        """Add a block's streams to `_shared_noise`. seen: its references in body axes."""
-        variance = np.diagonal(seen.noise, axis1=1, axis2=2)
-        known = seen.known[:, None] & (variance < MEASURED_BELOW)
+    def _compare_noise(self, streams: Cleaned, references: InBody) -> None:
+        """Add a block's streams to the test of shared noise. references: of the block, in body axes."""
+        variance = np.diagonal(references.noise, axis1=1, axis2=2)
+        known = references.known[:, None] & (variance < MEASURED_BELOW)
         self._seen_ahead = bool(known[:, 0].any()) or self._seen_ahead
         self._seen_upwards = bool(known[:, 2].any()) or self._seen_upwards
         at = streams.own_dvl
         in_the_body = streams.dvl.velocity[at] @ self._parameters.rotation_dvl_from_body
-        reference = np.where(known, seen.velocity, np.nan)
+        reference = np.where(known, references.velocity, np.nan)
         # at the original stamps, where filter output follows its input
         p = self._parameters
         times, reference_times = streams.dvl.times[at] + p.dvl_time_offset, streams.reference.times

@@ -76,14 +76,14 @@ class HeldOutLegs(NamedTuple):
 class Displacements(Estimator):
     """Estimator of `positions`, which collects dead reckoning and fixes and has them solved."""
 
-    def __init__(self, given: EstimatorSetup) -> None:
+    def __init__(self, setup: EstimatorSetup) -> None:
         """Start from the prior of its states."""
-        self._model, self._parameters, self._aligner = given.model, given.parameters, given.aligner
-        self._start = given.initial or prior(given.model, given.parameters)
-        self._on_look = given.on_evidence
-        self._worker = AtOnce() if given.worker is None else given.worker
-        self._is_asked = are_positions(given.parameters)
-        self._reckoning = DeadReckoning(given.parameters.rotation_dvl_from_body, 1e-9 * given.aligner.lag_ns)
+        self._model, self._parameters, self._aligner = setup.model, setup.parameters, setup.aligner
+        self._start = setup.initial or prior(setup.model, setup.parameters)
+        self._on_look = setup.on_evidence
+        self._worker = AtOnce() if setup.worker is None else setup.worker
+        self._is_asked = are_positions(setup.parameters)
+        self._reckoning = DeadReckoning(setup.parameters.rotation_dvl_from_body, 1e-9 * setup.aligner.lag_ns)
         self._n_taken = 0
         self._first_ns: int | None = None
         self._next_ns = self._oriented_ns = 0
@@ -125,12 +125,12 @@ class Displacements(Estimator):
         """See `Estimator`."""
         self.take_rows()
         while self._first_ns is not None and self._next_ns <= self._oriented_ns:
-            self._look(self._next_ns)
+            self._solve_complete_legs(self._next_ns)
             passed_s = 1e-9 * (self._next_ns - self._first_ns)
             self._next_ns = self._first_ns + round(1e9 * math.ceil(passed_s * GROWTH))
         self._let_take_effect(self._oriented_ns)
 
-    def _look(self, at_ns: int) -> None:
+    def _solve_complete_legs(self, at_ns: int) -> None:
         """Solve the legs that are complete at a stamp, whatever has arrived since."""
         assert self._first_ns is not None
         legs = self._reckoning.legs()
@@ -276,40 +276,42 @@ def navigated(held: HeldOutLegs, fit: DisplacementFit, parameters: Parameters, f
     first_ns: stamp of the legs' time 0. Lever arm, delay and heading deviation are from all data in both tracks, so
     they differ by mounting and scale only.
     """
-    legs, at = held.legs, np.flatnonzero(fit.used)
-    if len(at) < 2:
+    legs, used = held.legs, np.flatnonzero(fit.used)
+    if len(used) < 2:
         return None
-    seconds = legs.seconds[at]
-    goes_on = np.diff(legs.stretch[at]) == 0
+    seconds = legs.seconds[used]
+    in_stretch = np.diff(legs.stretch[used]) == 0
 
     def steps(values: Array) -> Array:
         """Return the horizontal change (K, 2) of values (N, 3) since the fix before; zero between stretches."""
-        return np.concatenate([np.zeros((1, 2)), np.diff(values[at, :2], axis=0) * goes_on[:, None]])
+        return np.concatenate([np.zeros((1, 2)), np.diff(values[used, :2], axis=0) * in_stretch[:, None]])
 
     moved = steps(np.einsum("nabc,bc->na", legs.way, parameters.rotation_dvl_from_body.T))
     distance = np.cumsum(np.linalg.norm(moved, axis=1))
     if distance[-1] < SHORTEST_M:
         return None
     before = steps(_position_errors(legs, fit, np.zeros(N_ERRORS), parameters))
-    after = np.zeros((len(at), 2))
+    after = np.zeros((len(used), 2))
     for fold, state in enumerate(held.states):
-        own = held.folds[at] == fold
-        after[own] = steps(_position_errors(legs, fit, state.x, parameters))[own]
-    track_errors = [np.cumsum(each, axis=0) for each in (before, after)]
-    residual = _position_errors(legs, fit, fit.errors.x, parameters)[at, :2]
+        in_fold = held.folds[used] == fold
+        after[in_fold] = steps(_position_errors(legs, fit, state.x, parameters))[in_fold]
+    error_before, error_after = np.cumsum(before, axis=0), np.cumsum(after, axis=0)
+    residual = _position_errors(legs, fit, fit.errors.x, parameters)[used, :2]
     reference = np.cumsum(steps(legs.position), axis=0)
     ends = ends_of_stretches(distance)
     stretch_m = float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]])
-    kept = np.round(np.linspace(0, len(at) - 1, min(MAP_POINTS, len(at)))).astype(np.intp)
-    in_body = [_velocities(each, seconds, legs.rotation[at])[kept] for each in track_errors]
+    shown = np.round(np.linspace(0, len(used) - 1, min(MAP_POINTS, len(used)))).astype(np.intp)
     return Navigation(
-        distance_m=float(distance[-1]), seconds=float(np.append(0.0, np.where(goes_on, np.diff(seconds), 0.0)).sum()),
-        stretch_m=stretch_m, stretches=len(ends) - 1, before=drift_over(track_errors[0], distance, ends),
-        after=drift_over(track_errors[1], distance, ends),
+        distance_m=float(distance[-1]), stretch_m=stretch_m,
+        seconds=float(np.append(0.0, np.where(in_stretch, np.diff(seconds), 0.0)).sum()),
+        stretches=len(ends) - 1, before=drift_over(error_before, distance, ends),
+        after=drift_over(error_after, distance, ends),
         noise_per_km=1000.0 * float(np.sqrt(2.0 * np.var(residual, axis=0).sum())) / stretch_m, on_a_map=True,
-        stamps_ns=first_ns + np.round(seconds[kept] * 1e9).astype(np.int64), distances=distance[kept],
-        reference=reference[kept], track_before=(reference - track_errors[0])[kept],
-        track_after=(reference - track_errors[1])[kept], error_before=in_body[0], error_after=in_body[1],
+        stamps_ns=first_ns + np.round(seconds[shown] * 1e9).astype(np.int64), distances=distance[shown],
+        reference=reference[shown], track_before=(reference - error_before)[shown],
+        track_after=(reference - error_after)[shown],
+        error_before=_velocities(error_before, seconds, legs.rotation[used])[shown],
+        error_after=_velocities(error_after, seconds, legs.rotation[used])[shown],
     )  # fmt: skip
 
 
@@ -360,20 +362,20 @@ def held_out(held: HeldOutLegs, fit: DisplacementFit, parameters: Parameters) ->
     legs, ends = held.legs, _ends(held, fit)
     if not len(ends):
         return None
-    fold_of_leg = held.folds[[each.first[0] for each in ends]]
+    fold_of_leg = held.folds[[end.first[0] for end in ends]]
     of_all = _velocity_errors(legs, ends, fit, fit.errors.x, parameters)
     before = _velocity_errors(legs, ends, fit, np.zeros(N_ERRORS), parameters)
     sums = np.zeros(5)
     for fold, state in enumerate(held.states):
-        own = fold_of_leg == fold
-        if not own.any():
+        in_fold = fold_of_leg == fold
+        if not in_fold.any():
             continue
-        own_ends = [each for each, is_own in zip(ends, own, strict=True) if is_own]
-        after = _velocity_errors(legs, ends, fit, state.x, parameters)[own]
-        jacobian = _jacobian(legs, own_ends, fit, state.x, parameters)
+        fold_ends = [end for end, is_in_fold in zip(ends, in_fold, strict=True) if is_in_fold]
+        after = _velocity_errors(legs, ends, fit, state.x, parameters)[in_fold]
+        jacobian = _jacobian(legs, fold_ends, fit, state.x, parameters)
         calibration = float(np.einsum("nij,jk,nik->", jacobian, state.p, jacobian))
-        noise = float((of_all[own] ** 2).sum())
-        sums += [float((before[own] ** 2).sum()), float((after**2).sum()), noise + calibration, calibration, 0.0]
+        noise = float((of_all[in_fold] ** 2).sum())
+        sums += [float((before[in_fold] ** 2).sum()), float((after**2).sum()), noise + calibration, calibration, 0.0]
     return held_out_from_sums(len(ends), sums)
 
 
@@ -381,16 +383,16 @@ def _ends(held: HeldOutLegs, fit: DisplacementFit) -> list[_LegEnds]:
     """Return the fixes at both ends of each held-out leg, in one stretch and without outliers."""
     legs = held.legs
     length_s = leg_length_s(legs)
-    at = np.flatnonzero(fit.used)
-    key = np.stack([legs.stretch[at], held.numbers[at]])
-    found = []
-    for part in np.split(at, np.flatnonzero((np.diff(key, axis=1) != 0).any(axis=0)) + 1):
-        seconds = legs.seconds[part]
-        if len(part) < 2 or seconds[-1] - seconds[0] < 0.5 * length_s:
+    used = np.flatnonzero(fit.used)
+    leg_of_fix = np.stack([legs.stretch[used], held.numbers[used]])
+    ends = []
+    for fixes in np.split(used, np.flatnonzero((np.diff(leg_of_fix, axis=1) != 0).any(axis=0)) + 1):
+        seconds = legs.seconds[fixes]
+        if len(fixes) < 2 or seconds[-1] - seconds[0] < 0.5 * length_s:
             continue
         reach_s = END_SHARE * (seconds[-1] - seconds[0])
-        found.append(_LegEnds(part[seconds <= seconds[0] + reach_s], part[seconds >= seconds[-1] - reach_s]))
-    return found
+        ends.append(_LegEnds(fixes[seconds <= seconds[0] + reach_s], fixes[seconds >= seconds[-1] - reach_s]))
+    return ends
 
 
 def _rates(values: Array, legs: Legs, ends: Sequence[_LegEnds]) -> Array:

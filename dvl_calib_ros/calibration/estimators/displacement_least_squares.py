@@ -5,6 +5,8 @@ arm (3) m beyond the parameters', delay of the fixes s, and heading deviation (5
 together. Their noise is white, plus a Gauss-Markov process (multipath, sound speed of a beacon) and a random walk (dead
 reckoning). A grid of hypotheses has their sizes and memories, and the result is the mixture by evidence, so σ includes
 the unknown noise.
+
+Shapes: N fixes, B blocks of time, A axes, G hypotheses of the noise, F sizes of the heading deviation.
 """
 
 from __future__ import annotations
@@ -158,7 +160,7 @@ def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
 
     errors = theta[:N_ERRORS]
     nudges = 1e-5 * np.eye(N_ERRORS)
-    slopes = [(matrix(errors + each) - matrix(errors - each)) / 2e-5 for each in nudges]
+    slopes = [(matrix(errors + nudge) - matrix(errors - nudge)) / 2e-5 for nudge in nudges]
     columns = np.empty((len(legs.seconds), 3, N_THETA))
     for state, slope in enumerate(slopes):
         columns[:, :, state] = np.einsum("nabc,bc->na", legs.way, slope)
@@ -184,7 +186,7 @@ def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
     weight, level = np.ones((len(rows), 2)), 1.0
     theta = np.zeros(N_THETA)
     for _ in range(12):
-        centred = rows - _of_stretches(rows, weight, stretch)[stretch]
+        centred = rows - _stretch_means(rows, weight, stretch)[stretch]
         flat = centred.reshape(-1, N_THETA + 1)
         products = (flat * weight.reshape(-1, 1)).T @ flat  # of y and the columns
         theta = np.linalg.solve(products[1:, 1:] + np.diag((level / std) ** 2), products[1:, 0])
@@ -194,7 +196,7 @@ def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
     return theta
 
 
-def _of_stretches(rows: Array, weight: Array, stretch: Index) -> Array:
+def _stretch_means(rows: Array, weight: Array, stretch: Index) -> Array:
     """Return weighted means (S, 2, 14) of rows (N, 2, 14) per stretch. weight: (N, 2). stretch: (N,)."""
     sums, total = np.zeros((int(stretch[-1]) + 1, *rows.shape[1:])), np.zeros((int(stretch[-1]) + 1, 2))
     np.add.at(sums, stretch, rows * weight[..., None])
@@ -211,32 +213,32 @@ def _no_outliers(residual: Array, stretch: Index) -> Mask:
     is_near = np.abs(from_neighbours) < OUTLIER_Z * np.maximum(robust_std(from_neighbours), 1e-6)
     from_stretch = residual.copy()
     for number in np.unique(stretch):
-        own = stretch == number
-        from_stretch[own] -= median(residual[own])
+        in_stretch = stretch == number
+        from_stretch[in_stretch] -= median(residual[in_stretch])
     in_reach = np.abs(from_stretch) < LASTING_OUTLIER_Z * np.maximum(robust_std(from_stretch), MIN_NOISE_M)
     return np.asarray((is_near & in_reach).all(axis=1))
 
 
 def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Blocks:
     """Average the fixes in `use` (N,) over blocks of time, along some axes (0: east, 1: north, 2: up)."""
-    at = np.flatnonzero(use)
-    seconds = legs.seconds[at]
+    used = np.flatnonzero(use)
+    seconds = legs.seconds[used]
     length = max(BLOCK_S, float(seconds[-1] - seconds[0]) / MAX_BLOCKS)
     number = np.floor((seconds - seconds[0]) / length).astype(np.intp)
-    key = np.stack([legs.stretch[at], number])
+    key = np.stack([legs.stretch[used], number])
     first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))
-    weight = np.diff(np.append(first, len(at))).astype(float)
+    weight = np.diff(np.append(first, len(used))).astype(float)
 
     def mean(values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, first, axis=0)) / weight.reshape(-1, *[1] * (values.ndim - 1))
 
-    y, columns = mean(linear.y[at][:, axes]), mean(linear.columns[at][:, axes])
-    stretch = legs.stretch[at][first]
+    y, columns = mean(linear.y[used][:, axes]), mean(linear.columns[used][:, axes])
+    stretch = legs.stretch[used][first]
     # a stretch of one block holds no information, as its constant is free; of very many stretches the longest suffice
     numbers, sizes = np.unique(stretch, return_counts=True)
     longest = np.argsort(-sizes, kind="stable")
     sufficient = np.cumsum(sizes[longest]) <= max(2 * MAX_BLOCKS, int(sizes.max()))
-    kept = np.isin(stretch, numbers[longest[(sizes[longest] > 1) & sufficient]])
+    kept = np.isin(stretch, numbers[longest[(sizes[longest] > 1) & sufficient]])  # blocks
     return _Blocks(mean(seconds)[kept], stretch[kept], weight[kept], y[kept].T, columns[kept].swapaxes(0, 1))
 
 
@@ -245,20 +247,23 @@ def _hypotheses(blocks: _Blocks) -> Array:
     seconds, white = blocks.seconds, 1.0 / blocks.weight
     usual = float(median(white))
     is_same_stretch = blocks.stretch[:, None] == blocks.stretch
-    starts = np.array([seconds[blocks.stretch == each][0] for each in blocks.stretch])
+    starts = np.array([seconds[blocks.stretch == number][0] for number in blocks.stretch])
     walk = np.where(is_same_stretch, np.minimum(seconds[:, None], seconds) - starts[:, None], 0.0) / WALK_S
     apart = np.abs(seconds[:, None] - seconds)
     lasting = [np.zeros_like(apart)] + [size * np.exp(-apart / tau) for size in LASTING for tau in LASTING_S]
-    each = np.array([process + size * walk for process in lasting for size in WALKED]) * usual + np.diag(white)
-    largest = np.diagonal(each, axis1=1, axis2=2).max(axis=1)
-    return np.asarray(each + FREE_VARIANCE * largest[:, None, None] * is_same_stretch)
+    covariance = np.array([process + size * walk for process in lasting for size in WALKED]) * usual + np.diag(white)
+    largest = np.diagonal(covariance, axis1=1, axis2=2).max(axis=1)
+    return np.asarray(covariance + FREE_VARIANCE * largest[:, None, None] * is_same_stretch)
 
 
 class _NormalEquations(NamedTuple):
     """Sums of squares and products over all blocks and axes, for G noise covariances and a white variance of 1.
 
-    square: (G,) of y. vector: (G, 13) of y and the columns. information: (G, 13, 13) of the columns. log_det: (G,) log
-    determinant of the noise covariance of all axes. freedom: degrees of freedom.
+    square: (G,) of y.
+    vector: (G, 13) of y and the columns.
+    information: (G, 13, 13) of the columns.
+    log_det: (G,) log determinant of the noise covariance of all axes.
+    freedom: degrees of freedom.
     """
 
     square: Array
@@ -328,14 +333,14 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> GaussianState:
     """Return the posterior from the mixture of all hypotheses."""
     if not len(blocks.seconds):
         return prior
-    each = _posteriors(_normal_equations(blocks), prior)
-    weight = np.exp(each.log_evidence - each.log_evidence.max())
+    posteriors = _posteriors(_normal_equations(blocks), prior)
+    weight = np.exp(posteriors.log_evidence - posteriors.log_evidence.max())
     weight /= weight.sum()
-    mean = np.einsum("gf,gfi->i", weight, each.x)
-    apart = each.x - mean
+    mean = np.einsum("gf,gfi->i", weight, posteriors.x)
+    spread = posteriors.x - mean
     # variance of Student's t, as few degrees of freedom determine the white variance
-    p = each.p * (each.freedom / (each.freedom - 2.0))[..., None, None]
-    total = np.einsum("gf,gfij->ij", weight, p) + np.einsum("gf,gfi,gfj->ij", weight, apart, apart)
+    p = posteriors.p * (posteriors.freedom / (posteriors.freedom - 2.0))[..., None, None]
+    total = np.einsum("gf,gfij->ij", weight, p) + np.einsum("gf,gfi,gfj->ij", weight, spread, spread)
     return GaussianState(mean, 0.5 * (total + total.T))
 
 
@@ -352,7 +357,9 @@ SHORTEST_FIX_NS = 950_000_000
 class Fixes(NamedTuple):
     """N position fixes in order of stamps.
 
-    stamps_ns: (N,). position: (N, 3) east, north, up, m, from any origin. variance: (N, 3) m², nan if not given.
+    stamps_ns: (N,).
+    position: (N, 3) east, north, up, m, from any origin.
+    variance: (N, 3) m², nan if not given.
     """
 
     stamps_ns: Stamps
@@ -378,10 +385,13 @@ class Fixes(NamedTuple):
 class Legs(NamedTuple):
     """N fixes, each with the dead reckoning to it since its stretch began. A stretch has no DVL gap.
 
-    seconds: (N,) since the first DVL sample. stretch: (N,) number. way: (N, 3, 3, 3) m, W = ∫ R ⊗ v dt over axes of
-    ENU, body and DVL; the displacement for a correction matrix M is W : M. drifted: (N, 3, 5) m/rad, derivative of the
-    displacement by the heading deviation, the drift being per second. rotation: (N, 3, 3) ENU from body. velocity:
-    (N, 3) m/s ENU, nominal mounting. position, variance: (N, 3) of the fixes.
+    seconds: (N,) since the first DVL sample.
+    stretch: (N,) number.
+    way: (N, 3, 3, 3) m, W = ∫ R ⊗ v dt over axes of ENU, body and DVL; a correction matrix M displaces by W : M.
+    drifted: (N, 3, 5) m/rad, derivative of the displacement by the heading deviation, the drift being per second.
+    rotation: (N, 3, 3) ENU from body.
+    velocity: (N, 3) m/s ENU, nominal mounting.
+    position, variance: (N, 3) of the fixes.
     """
 
     seconds: Array
@@ -519,12 +529,12 @@ class DeadReckoning:
         known = (at_s >= seconds[0]) & (stretch[after] == stretch[after - 1])
         fixes, at_s, after = fixes.part(np.flatnonzero(known)), at_s[known], after[known]
         share = ((at_s - seconds[after - 1]) / (seconds[after] - seconds[after - 1]))[:, None]
-        found = sums[after - 1] + share * (sums[after] - sums[after - 1])
+        integrals = sums[after - 1] + share * (sums[after] - sums[after - 1])
         n, nearest = len(at_s), after - (share[:, 0] < 0.5)
         rotation = rotation_from_quaternion(quaternion[nearest])
         rate = (rates[after - 1] + share * (rates[after] - rates[after - 1]))[:, _WAY].reshape(n, 3, 3, 3)
         velocity = np.einsum("nabc,bc->na", rate, self._body_from_dvl)
-        way, drifted = found[:, _WAY].reshape(n, 3, 3, 3), found[:, _DRIFTED].reshape(n, 3, N_HEADING)
+        way, drifted = integrals[:, _WAY].reshape(n, 3, 3, 3), integrals[:, _DRIFTED].reshape(n, 3, N_HEADING)
         self._done.append(Legs(at_s, stretch[after], way, drifted, rotation, velocity, fixes.position, fixes.variance))
 
 

@@ -43,10 +43,11 @@ SOLVED_WITHIN_NS = 1_000_000_000
 class EstimatorSetup:
     """Arguments for making an estimator.
 
-    initial: initial state of the model. on_evidence: called when a result takes effect, with the stamp of the first DVL
-    sample that it may affect. verified: keep what hold-out verification needs. worker: runs slow work in order, in
-    one thread, so that live messages do not wait; None runs it immediately. together: number of blocks gathered before
-    they are solved, unless a result is requested.
+    initial: initial state of the model.
+    on_evidence: called when a result takes effect, with the stamp of the first DVL sample that it may affect.
+    verified: keep what hold-out verification needs.
+    worker: runs slow work in order, in one thread, so that live messages do not wait; None runs it immediately.
+    together: number of blocks gathered before they are solved, unless a result is requested.
     """
 
     model: Model
@@ -258,11 +259,11 @@ class Remembered(NamedTuple):
 
 def states_in_effect(remembered: Sequence[Remembered], stamps_ns: Stamps) -> PastStates:
     """Return the states in effect at stamps (E,). remembered: in order; the first one is from the beginning on."""
-    at = np.searchsorted([each.from_ns for each in remembered], stamps_ns, side="right") - 1
+    at = np.searchsorted([past.from_ns for past in remembered], stamps_ns, side="right") - 1
     in_effect = [remembered[index] for index in at.tolist()]
-    x, p = np.array([each.state.x for each in in_effect]), np.array([each.state.p for each in in_effect])
-    used = np.array([each.used for each in in_effect], dtype=np.int64)
-    return PastStates(GaussianState(x, p), used, np.array([each.nis_sum for each in in_effect]))
+    x, p = np.array([past.state.x for past in in_effect]), np.array([past.state.p for past in in_effect])
+    used = np.array([past.used for past in in_effect], dtype=np.int64)
+    return PastStates(GaussianState(x, p), used, np.array([past.nis_sum for past in in_effect]))
 
 
 class LinearEstimator(Estimator):
@@ -334,9 +335,11 @@ class AtOnce(Executor):
 class Residuals(NamedTuple):
     """Residuals of a calibration.
 
-    held_out: velocity error on held-out data. typical: m/s rms with the state from all data, without outliers; None
-    without any. judged: samples and velocity products, see `calibration_error`. navigation: held-out drift of dead
-    reckoning, with heading deviation. in_earth: whether the reference is in an earth frame.
+    held_out: velocity error on held-out data.
+    typical: m/s rms with the state from all data, without outliers; None without any.
+    judged: samples and velocity products, see `calibration_error`.
+    navigation: held-out drift of dead reckoning, with heading deviation.
+    in_earth: whether the reference is in an earth frame.
     """
 
     held_out: HeldOutError | None

@@ -29,7 +29,7 @@ def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameter
         return delay
     best = int(np.argmin(squares))
     at_current = float(np.interp(delay, DELAYS_S, squares))
-    n = sum(len(each.body) for each in rows)
+    n = sum(len(row.body) for row in rows)
     is_significant = n * math.log(at_current / squares[best]) > MIN_CHI2_GAIN * CORRELATED_ROWS
     return float(DELAYS_S[best]) if is_significant and abs(DELAYS_S[best] - delay) > STEP_S else delay
 

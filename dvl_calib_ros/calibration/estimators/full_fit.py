@@ -3,6 +3,8 @@
 The method is in docs/models.md, "full: all unknowns in one fit". Blocks are linearised about one point and added to a
 chain (slow_errors.py), so each further block costs one step. The point is renewed when a day's number of blocks reaches
 a power of two, or when the estimate has moved away from it. Both depend on the blocks only, so live and replay agree.
+
+Shapes: C points of the prior of the slow errors, A combinations of priors, n states of [vehicle, each day].
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from ..numerics.samples import Index
 from ..results.results import TAPE_STD_M
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
-from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
+from .full_held_out import INSTRUMENT_ERRORS, HeldOutSums
 from .section_rows import GATE_SQUARE, SectionRows, effects_gram, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
@@ -67,8 +69,10 @@ _UNIT_POINTS: Array = normal_points(5, N_POINTS)
 class _Section(NamedTuple):
     """Interval between two knots.
 
-    seconds: length. gram: of its rows, None without rows. fold: hold-out fold. up: (21,) mean of `PredictedRows.up`,
-    its velocity at zero states; None without attitude or vertical reference.
+    seconds: length.
+    gram: (WIDTH, WIDTH) Gram matrix of its rows, see slow_errors.py; None without rows.
+    fold: hold-out fold.
+    up: (21,) mean of `PredictedRows.up`, its velocity at zero states; None without attitude or vertical reference.
     """
 
     seconds: float
@@ -81,10 +85,13 @@ class _Section(NamedTuple):
 class _Day:
     """Blocks of one day (recordings with one DVL delay), and their normal equations about the point of linearisation.
 
-    count: number of blocks so far. sections: of the blocks whose streams are kept. before: chains of older blocks, with
-    all sections and without each fold. chain: of all blocks. white: (3,) variance of a bin of weight one. single: (3,)
-    variance of a row about its section's median. level, level_std: (3,) m/s, median and scatter of the sections'
-    medians.
+    count: number of blocks so far.
+    sections: of the blocks whose streams are kept.
+    before: chains of older blocks, with all sections and without each fold.
+    chain: of all blocks.
+    white: (3,) variance of a bin of weight one.
+    single: (3,) variance of a row about its section's median.
+    level, level_std: (3,) m/s, median and scatter of the sections' medians.
     """
 
     blocks: list[FitBlock] = field(default_factory=list)
@@ -122,8 +129,9 @@ class _PriorInformation(NamedTuple):
 class _Climb(NamedTuple):
     """Mean velocity upwards of a day by its DVL.
 
-    at: (20,) indices of its states. row: (21,) derivatives by these, and m/s at zero states. std: m/s, of a vehicle
-    that is level.
+    at: (20,) indices of its states.
+    row: (21,) derivatives by these, and m/s at zero states.
+    std: m/s, of a vehicle that is level.
     """
 
     at: Index
@@ -132,9 +140,10 @@ class _Climb(NamedTuple):
 
 
 class _Hypotheses(NamedTuple):
-    """A combinations of priors and B paths of the vehicle, at C points of the slow errors, over n states.
+    """A combinations of priors and B vertical paths of the vehicle, at C points of the slow errors, over n states.
 
-    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C). log_odds: (A, B).
+    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C).
+    log_odds: (A, B) of each combination and path.
     climb_mps: (B,) m/s, σ of a day's mean climb.
     """
 
@@ -210,12 +219,12 @@ class JointFit:
         """Take the next block. Raise numpy.linalg.LinAlgError and keep the earlier fit if numbers diverge."""
         day = self._days[-1]
         state = self._x.copy(), self._fitted, self.used, self.gated, self._misfit
-        kept = [(each, replace(each, blocks=[*each.blocks], sections=[*each.sections])) for each in self._days]
+        kept = [(day, replace(day, blocks=[*day.blocks], sections=[*day.sections])) for day in self._days]
         try:
             self._add(day, block)
             assert self._fitted is not None
             if not all(np.isfinite(value).all() for value in self._fitted.state):
-                raise np.linalg.LinAlgError("numbers that ran away")
+                raise np.linalg.LinAlgError("the fit diverged")
         except np.linalg.LinAlgError:
             self._x, self._fitted, self.used, self.gated, self._misfit = state
             self._days = [before for _, before in kept]
@@ -342,18 +351,22 @@ class JointFit:
             self._add_parts(day, parts, x)
 
     def _parts(self, blocks: Sequence[FitBlock], x: Array) -> list[SectionRows]:
-        """Return the sections of blocks about a state (20,) of their day."""
-        found = []
+        """Return the sections of blocks, linearised about a state x (20,) of their day."""
+        sections = []
         for block, rows in zip(blocks, predicted(blocks, x, self._parameters), strict=True):
             starts = section_starts(block)
             bounds = [*starts, block.end_s + 1e-9]
-            none = [None] * len(starts)
-            each = none if rows is None else rows.parts(np.searchsorted(rows.times, bounds).tolist())
-            found += [SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
-        return found
+            no_parts = [None] * len(starts)
+            parts = no_parts if rows is None else rows.parts(np.searchsorted(rows.times, bounds).tolist())
+            sections += [SectionRows(from_s, part, block) for from_s, part in zip(starts, parts, strict=True)]
+        return sections
 
     def _measure_noise(self, day: _Day, parts: Sequence[SectionRows]) -> None:
-        """Estimate the white noise of single rows and of bins from their scatter within sections."""
+        """Estimate a day's noise from the scatter of its sections; see the fields of `_Day`.
+
+        single: variance of rows about their section's median. white: variance of bins about a line per section.
+        level, level_std: median of the sections' medians and their scatter, by which gross sections are rejected.
+        """
         residuals = [part.residual for part in parts if part.rows is not None]
         if not residuals:
             return
@@ -361,8 +374,8 @@ class JointFit:
         day.level = masked_median(levels)
         day.level_std = np.maximum(masked_median(np.abs(levels - day.level)) / MEDIAN_DISTANCE, GROSS_MPS / GROSS)
         day.single = np.maximum(usual_square(np.concatenate(residuals)), ROUNDING_MPS**2)
-        each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
-        total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))
+        scatters = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
+        total, freedom = (np.sum(sums, axis=0) for sums in zip(*scatters, strict=True))
         white = np.maximum(total / np.maximum(freedom, 1.0), ROUNDING_MPS**2)
         day.white = np.where(freedom < MIN_DOF, day.single, white)
 
@@ -415,9 +428,8 @@ class JointFit:
         if self._without is None or self._without[0] is not self._fitted:
             ended, states = [self._ended_without_folds(day) for day in self._days], []
             for fold in range(FOLDS):
-                without = [each and each.part(slice(fold, fold + 1)) for each in ended]
-                found = self._mixture(without, self._likeliest, self._climbs(fold))
-                states.append(self._by_day(found.state))
+                without = [state and state.part(slice(fold, fold + 1)) for state in ended]
+                states.append(self._by_day(self._mixture(without, self._likeliest, self._climbs(fold)).state))
             self._without = self._fitted, states
         return self._without[1]
 
@@ -426,10 +438,10 @@ class JointFit:
         if day.chain is None:
             return None
         likeliest, folds = self._points.slow.part(self._likeliest), np.arange(FOLDS)
-        slow = SlowErrors(*(np.repeat(each, FOLDS, axis=0) for each in likeliest))
+        slow = SlowErrors(*(np.repeat(values, FOLDS, axis=0) for values in likeliest))
         chain = Chain.begun(slow)
         if day.before is not None:
-            older = [each.part(self._likeliest) for each in day.before[1:]]
+            older = [chain.part(self._likeliest) for chain in day.before[1:]]
             chain = Chain(*map(np.concatenate, zip(*older, strict=True)))
         for section in day.sections:
             gram = None if section.gram is None else section.gram * (folds != section.fold)[:, None, None]
@@ -449,15 +461,15 @@ class JointFit:
         sums, seconds = HeldOutSums(), 0.0
         for day in self._days:
             for block in day.blocks:
-                sums.claims(block)
+                sums.add_claimed(block)
         for fold, states in enumerate(self.without_folds()):
             for day, state in zip(self._days, states, strict=True):
                 published = state.x.copy()
-                published[NOT_TAKEN_OFF] = 0.0
-                nominal = np.zeros(N_STATE)
+                published[INSTRUMENT_ERRORS] = 0.0
                 blocks = [block for block in day.blocks if (block.fold == fold).any()]
-                both = [predicted(blocks, x, self._parameters) for x in (nominal, published)]
-                for block, before, after in zip(blocks, *both, strict=True):
+                uncorrected = predicted(blocks, np.zeros(N_STATE), self._parameters)
+                corrected = predicted(blocks, published, self._parameters)
+                for block, before, after in zip(blocks, uncorrected, corrected, strict=True):
                     if before is None or after is None:
                         continue
                     sums.add(before, after, fold, state, day.single, slow_variance)
@@ -491,17 +503,17 @@ class JointFit:
         return most_significant(blocks, prior.information[0], prior.vector[0], mean_velocity)
 
     def _climbs(self, without: int = -1) -> list[_Climb]:
-        """Return the mean climb of every day that shows one. without: fold that is held out."""
-        found = []
+        """Return the mean climb of every day whose vertical velocity is measured. without: fold that is held out."""
+        climbs = []
         for number, day in enumerate(self._days):
-            rows = [each.up for each in day.sections if each.up is not None and each.fold != without]
+            rows = [section.up for section in day.sections if section.up is not None and section.fold != without]
             if len(rows) > 1:
                 at, up = self._of_day(number), np.array(rows)
                 velocity = up[:, :-1] @ self._x[at] + up[:, -1]
                 path = BLOCK_S * np.cumsum(velocity - velocity.mean())
                 std = (LEVEL_M + float(np.ptp(path))) / (BLOCK_S * len(up))
-                found.append(_Climb(at, up.mean(axis=0), min(std, DIVE_STD_MPS)))
-        return found
+                climbs.append(_Climb(at, up.mean(axis=0), min(std, DIVE_STD_MPS)))
+        return climbs
 
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice, climbs: Sequence[_Climb]) -> JointEstimate:
         """Return mean and covariance over points of the slow errors and over the hypotheses of the priors.
@@ -556,9 +568,9 @@ class JointFit:
             paths = {0.0: 1.0 - sum(climbs.values()), **climbs}
             cases = list(itertools.product(arms, offsets))
             priors = [self._prior_information(points, arm, offset) for arm, offset in cases]
-            information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
-            of_cases = np.array([arms[arm] * offsets[offset] for arm, offset in cases])
-            log_odds = np.log(of_cases[:, None] * np.array([*paths.values()]))
+            information, vector, log_det = (np.stack(parts) for parts in zip(*priors, strict=True))
+            case_odds = np.array([arms[arm] * offsets[offset] for arm, offset in cases])
+            log_odds = np.log(case_odds[:, None] * np.array([*paths.values()]))
             self._known[key] = _Hypotheses(information, vector, log_det, log_odds, np.array([*paths]))
         return self._known[key]
 

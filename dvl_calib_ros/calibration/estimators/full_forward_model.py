@@ -1,7 +1,10 @@
 """Forward model of `full`: predicted reference velocities and their derivatives by the states.
 
-The model is in docs/models.md, "full: all unknowns in one fit"; a reference in body axes is compared with the bracket
-alone. The DVL's velocity is interpolated by a cubic spline: a straight line loses 2 % of waves sampled at 4 Hz.
+The model is in docs/models.md, "full: all unknowns in one fit". A reference in body axes is compared with the velocity
+in the body, without attitude. The DVL's velocity is interpolated by a cubic spline: a straight line loses 2 % of waves
+sampled at 4 Hz.
+
+Shapes: J references, N samples of the DVL, M of the IMU.
 """
 
 from __future__ import annotations
@@ -53,9 +56,11 @@ GAP_INTERVALS, GAP_S = 3.0, 1.2
 class FitBlock:
     """All streams of a block of time; DVL and IMU extend beyond it for delays up to LONGEST_DELAY_S.
 
-    from_s, end_s: the block's limits. slope: (N, 3) m/s², of the DVL's spline at its samples. imu_slope: (M, 7) per s,
-    of the IMU's quaternion (of continuous sign) and angular velocity. measured: (J, 3) whether a reference measures
-    each axis of its own frame. fold: (J,) hold-out fold of each reference.
+    from_s, end_s: the block's limits.
+    slope: (N, 3) m/s², of the DVL's spline at its samples.
+    imu_slope: (M, 7) per s, of the IMU's quaternion (of continuous sign) and angular velocity.
+    measured: (J, 3) whether a reference measures each axis of its own frame.
+    fold: (J,) hold-out fold of each reference.
     """
 
     from_s: float
@@ -102,12 +107,17 @@ class FitBlock:
 
 
 class PredictedRows(NamedTuple):
-    """Residuals and derivatives of J references about a state.
+    """Residuals of J references, and derivatives of their prediction, at a state (20,).
 
-    times: (J,) s. residual: (J, 3) m/s. columns: (J, 3, 20) derivatives of the prediction by the states. slow:
-    (J, 3, 6) by the slow errors. weight: (J, 3) per axis. fold: (J,). up: (J, 21) derivatives of the DVL's velocity
-    upwards by the states, and that velocity (m/s); 0 without attitude. oriented: (J,) whether it has attitude. dvl:
-    (J, 3) m/s, mean of the DVL's velocities before and after, whose noise is not in the residual.
+    times: (J,) s.
+    residual: (J, 3) m/s.
+    columns: (J, 3, 20) derivatives of the prediction by the states.
+    slow: (J, 3, 6) derivatives of the prediction by the slow errors.
+    weight: (J, 3) 1 where a reference measures the axis, else 0.
+    fold: (J,) hold-out fold.
+    up: (J, 21) derivatives of the DVL's velocity upwards by the states, and that velocity (m/s); 0 without attitude.
+    oriented: (J,) whether there is an attitude.
+    dvl: (J, 3) m/s, mean of the DVL's velocities before and after, whose noise is not in the residual.
     """
 
     times: Array
@@ -156,8 +166,9 @@ def spline_slopes(times: Array, values: Array) -> Array:
 class AttitudeAt(NamedTuple):
     """Attitude ``rotation_enu_from_body`` (J, 3, 3), identity without one, and turn rates at J times.
 
-    oriented: (J,) where the attitude is known. rates: (J, 3) rad/s, and their derivative `turning` (J, 3) rad/s², body
-    axes; rates_known: (J,).
+    oriented: (J,) where the attitude is known.
+    rates: (J, 3) rad/s, and their derivative `turning` (J, 3) rad/s², body axes.
+    rates_known: (J,).
     """
 
     rotation: Array
@@ -187,15 +198,15 @@ class JoinedBlocks:
         )
         self.measured = np.concatenate([block.measured for block in blocks])
 
-    def by_row(self, of_blocks: Sequence[Any]) -> NDArray[Any]:
-        """Return values (J,) of the block of each reference."""
-        return np.repeat(of_blocks, self._counts)
+    def by_row(self, block_values: Sequence[Any]) -> NDArray[Any]:
+        """Return for each of the J references the value of its block."""
+        return np.repeat(block_values, self._counts)
 
     def dvl_at(self, times: Array) -> tuple[Array, Mask]:
         """Interpolate the DVL's velocity (..., J, 3) m/s at times (..., J) s; return whether it is known (..., J)."""
         gap_s = self.by_row([max(GAP_INTERVALS * block.interval_s, GAP_S) for block in self.blocks])
         spline = _Spline(self, [block.dvl.times for block in self.blocks], times, gap_s)
-        return spline.of([(block.dvl.velocity, block.slope) for block in self.blocks]), spline.known
+        return spline.interpolate([(block.dvl.velocity, block.slope) for block in self.blocks]), spline.known
 
     def attitude_at(self, times: Array, gap_s: float) -> AttitudeAt:
         """Interpolate attitude and turn rates at times (J,) s, across gaps of up to gap_s.
@@ -204,56 +215,63 @@ class JoinedBlocks:
         """
         around = times + np.array([[0.0], [-TURNING_S], [TURNING_S]])
         spline = _Spline(self, [block.imu.times for block in self.blocks], around, gap_s)
-        rates, before, after = spline.of(
+        rates, before, after = spline.interpolate(
             [(block.imu.angular_velocity, block.imu_slope[:, 4:]) for block in self.blocks]
         )
-        q = spline.of([(block.imu.orientation, block.imu_slope[:, :4]) for block in self.blocks], 0)
+        q = spline.interpolate([(block.imu.orientation, block.imu_slope[:, :4]) for block in self.blocks], 0)
         rotation = rotation_from_quaternion(q / np.sqrt(squared(q))[:, None])
         # references in body axes need no attitude
-        has = self.by_row([not np.isnan(block.imu.orientation).any() for block in self.blocks])
-        rotation[~has] = np.eye(3)
+        has_attitude = self.by_row([not np.isnan(block.imu.orientation).any() for block in self.blocks])
+        rotation[~has_attitude] = np.eye(3)
         known = spline.known[0]
-        return AttitudeAt(rotation, known & has, rates, (after - before) / (2.0 * TURNING_S), known)
+        return AttitudeAt(rotation, known & has_attitude, rates, (after - before) / (2.0 * TURNING_S), known)
 
 
 class _Spline:
-    """Cubic spline through samples of joined blocks; unknown outside the samples and across gaps longer than gap_s."""
+    """Cubic spline through the samples of joined blocks, evaluated at times of their J references.
+
+    known: (..., J) false outside the samples of a block, and across gaps longer than gap_s.
+    """
 
     def __init__(self, joined: JoinedBlocks, stamps: Sequence[Array], times: Array, gap_s: Array | float) -> None:
-        """Find the samples beside times (..., J) s. stamps: (N,) s of each block. gap_s: (J,)."""
-        lengths = [len(own) for own in stamps]
-        last = joined.by_row([*accumulate(lengths)]) - 1
+        """Find the two samples that enclose each time.
+
+        stamps: (N,) s, of the samples of each block.
+        times: (..., J) s, to evaluate at; column j lies in the block of reference j.
+        gap_s: (J,) or one for all, longest gap (s) that is interpolated.
+        """
+        lengths = [len(block_stamps) for block_stamps in stamps]
+        last = joined.by_row([*accumulate(lengths)]) - 1  # index of the last sample of each reference's block
         first = last - joined.by_row(lengths) + 1
         after = np.empty(times.shape, dtype=np.intp)
-        for own, at in zip(stamps, joined.rows, strict=True):
-            after[..., at] = own.searchsorted(times[..., at])
+        for block_stamps, references in zip(stamps, joined.rows, strict=True):
+            after[..., references] = block_stamps.searchsorted(times[..., references])
         after = np.minimum(np.maximum(after, 1) + first, last)
-        every = np.concatenate(stamps)
-        begin = every.take(after - 1)
-        step = every.take(after) - begin
-        self._after, self._step, self._part = after, step[..., None], ((times - begin) / step)[..., None]
-        self.known = (times >= every.take(first)) & (times <= every.take(last)) & (step <= gap_s)
+        all_stamps = np.concatenate(stamps)
+        begin = all_stamps.take(after - 1)
+        step = all_stamps.take(after) - begin
+        self._after, self._step, self._share = after, step[..., None], ((times - begin) / step)[..., None]
+        self.known = (times >= all_stamps.take(first)) & (times <= all_stamps.take(last)) & (step <= gap_s)
 
-    def of(self, columns: Sequence[tuple[Array, Array]], row: EllipsisType | int = ...) -> Array:
+    def interpolate(self, columns: Sequence[tuple[Array, Array]], row: EllipsisType | int = ...) -> Array:
         """Interpolate values (N, k) of each block with slopes (N, k), see `spline_slopes`, at one row of the times."""
-        values, slope = (np.concatenate(each) for each in zip(*columns, strict=True))
-        after, step, part = self._after[row], self._step[row], self._part[row]
-        before, rest = after - 1, 1.0 - part
-        found: Array = (
-            values.take(before, axis=0) * (rest * rest * (1.0 + 2.0 * part))
-            + values.take(after, axis=0) * (part * part * (1.0 + 2.0 * rest))
-            + step * part * rest * (slope.take(before, axis=0) * rest - slope.take(after, axis=0) * part)
+        values, slope = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+        after, step, share = self._after[row], self._step[row], self._share[row]
+        before, rest = after - 1, 1.0 - share
+        return np.asarray(
+            values.take(before, axis=0) * (rest * rest * (1.0 + 2.0 * share))
+            + values.take(after, axis=0) * (share * share * (1.0 + 2.0 * rest))
+            + step * share * rest * (slope.take(before, axis=0) * rest - slope.take(after, axis=0) * share)
         )
-        return found
 
 
 def predicted(blocks: Sequence[FitBlock], x: Array, parameters: Parameters) -> list[PredictedRows | None]:
     """Return the rows of each block about a state x (20,); None without a comparable reference."""
-    found: list[PredictedRows | None] = [None] * len(blocks)
+    rows_of_blocks: list[PredictedRows | None] = [None] * len(blocks)
     for numbers, joined in joined_blocks(blocks):
         for number, rows in zip(numbers, _predicted(joined, x, parameters), strict=True):
-            found[number] = rows
-    return found
+            rows_of_blocks[number] = rows
+    return rows_of_blocks
 
 
 def joined_blocks(blocks: Sequence[FitBlock]) -> Iterator[tuple[list[int], JoinedBlocks]]:
@@ -267,8 +285,9 @@ def joined_blocks(blocks: Sequence[FitBlock]) -> Iterator[tuple[list[int], Joine
 class _AtReferences(NamedTuple):
     """Streams at the delayed times of the J usable references of joined blocks.
 
-    used: (J,) their indices. turns: (J, 1) 0 for a reference in body axes, else 1. velocity, earlier, later: (J, 3) m/s
-    of the DVL, its frame, then, and `reach` (J,) s before and after.
+    used: (J,) their indices.
+    turns: (J, 1) 0 for a reference in body axes, else 1.
+    velocity, earlier, later: (J, 3) m/s of the DVL, its frame, then, and `reach` (J,) s before and after.
     """
 
     used: Index

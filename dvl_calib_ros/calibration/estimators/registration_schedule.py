@@ -72,7 +72,7 @@ class _Imu(RowTable):
     angular_velocity: Array = column(np.float64, 3)
 
 
-class _Registered:
+class _NewestBlocks:
     """Streams of the newest blocks as registration needs them, without covariances between axes."""
 
     def __init__(self) -> None:
@@ -87,17 +87,17 @@ class _Registered:
         for stream in self._streams:
             stream.reserve((KEPT_BLOCKS + 1) * ROWS_PER_BLOCK)
 
-    def add(self, kept: ThinnedBlock) -> None:
+    def add(self, block: ThinnedBlock) -> None:
         """Add a block, and drop the oldest beyond `KEPT_BLOCKS`."""
-        r = kept.reference
+        r = block.reference
         variance = np.diagonal(r.noise, axis1=1, axis2=2)
-        own_noise = np.full(len(kept.dvl.times), np.trace(kept.noise_dvl))
-        columns = (*kept.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), kept.imu
-        for stream, own in zip(self._streams, columns, strict=True):
-            at = stream.extend(len(own[0]))
-            for name, values in zip(stream.LAYOUT, own, strict=True):
-                getattr(stream, name)[at] = values
-        self._blocks.append(tuple(len(own[0]) for own in columns))
+        own_noise = np.full(len(block.dvl.times), np.trace(block.noise_dvl))
+        columns = (*block.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), block.imu
+        for stream, own_columns in zip(self._streams, columns, strict=True):
+            rows = stream.extend(len(own_columns[0]))
+            for name, values in zip(stream.LAYOUT, own_columns, strict=True):
+                getattr(stream, name)[rows] = values
+        self._blocks.append(tuple(len(own_columns[0]) for own_columns in columns))
         if len(self._blocks) > KEPT_BLOCKS:
             for stream, n in zip(self._streams, self._blocks.popleft(), strict=True):
                 stream.forget_before(stream.begin + n)
@@ -139,7 +139,7 @@ class FitSoFar(NamedTuple):
     epoch_ns: int
 
 
-class Looked(NamedTuple):
+class RegistrationResult(NamedTuple):
     """Registration after a number of blocks, the fitting configuration if not the given one, and live residuals."""
 
     blocks: int = 0
@@ -148,71 +148,72 @@ class Looked(NamedTuple):
     residuals: Residuals | None = None
 
 
-class KeptClocks:
+class RegistrationSchedule:
     """Registration results of earlier days and of the current one."""
 
     def __init__(self, parameters: Parameters, live: bool) -> None:
         """Start without blocks. live: the run may last hours."""
         self._parameters, self._is_live = parameters, live
-        self._seen = _Registered()
+        self._newest = _NewestBlocks()
         if live:
-            self._seen.take_room()
+            self._newest.take_room()
         self._blocks = 0  # of this day
         self._declared = np.zeros(len(FRAMES), dtype=np.int64)  # references said to be in each frame
-        self._over: Looked | None = None  # of an earlier day with a contradiction
-        self._latest = Looked()
+        self._contradicted: RegistrationResult | None = None  # of an earlier day with a contradiction
+        self._latest = RegistrationResult()
 
-    def add(self, kept: ThinnedBlock, frames: Codes, from_ns: int) -> None:
+    def add(self, block: ThinnedBlock, frames: Codes, from_ns: int) -> None:
         """Add a block's streams. frames: (J,) declared frame codes of its references. from_ns: the block's start."""
-        self._seen.add(kept)
+        self._newest.add(block)
         self._declared += np.bincount(frames, minlength=len(FRAMES))
         self._blocks += 1
 
     def end_day(self) -> None:
         """Begin a new day, whose clock offsets may differ."""
-        found = self.looked()
-        self._over = found if found.configuration or self.contradiction(found) else None
-        self._seen.clear()
-        self._blocks, self._latest = 0, Looked()
+        found = self.latest()
+        self._contradicted = found if found.configuration or self.contradiction(found) else None
+        self._newest.clear()
+        self._blocks, self._latest = 0, RegistrationResult()
 
-    def look_again(self, fit_so_far: FitSoFar | None) -> None:
+    def register_again(self, fit_so_far: FitSoFar | None) -> None:
         """Repeat the registration if there is enough new data. fit_so_far: the fit so far; None without data."""
-        if self._over is None and self._blocks >= max(REPEATED_AT_GROWTH * self._latest.blocks, FIRST_LIVE_BLOCKS):
-            self._latest = self._look(fit_so_far)
+        enough = max(REPEATED_AT_GROWTH * self._latest.blocks, FIRST_LIVE_BLOCKS)
+        if self._contradicted is None and self._blocks >= enough:
+            self._latest = self._register(fit_so_far)
 
-    def looked(self, fit_so_far: FitSoFar | None = None, *, fresh: bool = True) -> Looked:
+    def latest(self, fit_so_far: FitSoFar | None = None, *, fresh: bool = True) -> RegistrationResult:
         """Return the registration of the blocks so far, or of an earlier day with a contradiction.
 
-        fresh: use all blocks, else those of the latest `look_again`.
+        fresh: use all blocks, else those of the latest `register_again`.
         """
-        if self._over is not None:
-            return self._over
+        if self._contradicted is not None:
+            return self._contradicted
         if fresh and self._blocks > self._latest.blocks:
-            self._latest = self._look(fit_so_far)
+            self._latest = self._register(fit_so_far)
         return self._latest
 
-    def contradiction(self, looked: Looked) -> Reason | None:
+    def contradiction(self, registered: RegistrationResult) -> Reason | None:
         """Return the clock settings that fit the registration, if the configured ones do not."""
-        return None if looked.registration is None else looked.registration.contradiction(self._parameters)
+        return None if registered.registration is None else registered.registration.contradiction(self._parameters)
 
-    def _look(self, fit_so_far: FitSoFar | None) -> Looked:
-        """Register the kept blocks."""
-        motion = self._seen.motion() if len(self._seen) >= MIN_BLOCKS else None
+    def _register(self, fit_so_far: FitSoFar | None) -> RegistrationResult:
+        """Register clocks and frames from the newest blocks, and compute live residuals of the fit so far."""
+        motion = self._newest.motion() if len(self._newest) >= MIN_BLOCKS else None
         if motion is None:
-            return Looked(self._blocks)
+            return RegistrationResult(self._blocks)
         nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)
         declared = FRAMES[int(self._declared.argmax())]
         try:
             found = register(motion, nominal, lever_arm)
             configuration = fitting_configuration(motion, declared, found, self._parameters)
             residuals = self._residuals(fit_so_far) if self._is_live and fit_so_far is not None else None
-            return Looked(self._blocks, found, configuration, residuals)
+            return RegistrationResult(self._blocks, found, configuration, residuals)
         except np.linalg.LinAlgError:  # the fit diverged
-            return Looked(self._blocks)
+            return RegistrationResult(self._blocks)
 
     def _residuals(self, fit_so_far: FitSoFar) -> Residuals:
         """Return the residuals of all kept blocks, each corrected by the fit without its fold."""
-        recording, p = self._seen.recording(), self._parameters
+        recording, p = self._newest.recording(), self._parameters
         fit, epoch_ns = fit_so_far
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         state = fit.states[-1]

@@ -1,4 +1,7 @@
-"""Rows of `full` between two knots of its slow errors: their median, misfit, mean climb and bins."""
+"""Rows of `full` between two knots of its slow errors: their median, misfit, mean climb and bins.
+
+Shapes: J references of a section, k tested effects.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ class SectionRows:
             self.residual = residual - self.level
 
     def with_effects(self, velocities: Callable[[Array], Array]) -> SectionRows:
-        """Return the rows with derivatives by effects, from `velocities` (N, 3, k) that a DVL (N, 3) has too much."""
+        """Return the rows with derivatives by k effects. velocities: DVL (N, 3) m/s -> its error (N, 3, k)."""
         assert self.rows is not None
         more = self.rows.columns[:, :, BIAS] @ velocities(self.rows.dvl)
         whole = copy.copy(self)
@@ -44,8 +47,7 @@ class SectionRows:
 
     def misfit(self, single: Array) -> Array:
         """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
-        found: Array = (np.nan_to_num(self.residual) ** 2 / single).sum(axis=1)
-        return found
+        return np.asarray((np.nan_to_num(self.residual) ** 2 / single).sum(axis=1))
 
     def up(self, x: Array) -> Array | None:
         """Return the mean velocity upwards (21,): derivatives by the states, and m/s at zero states; None if unknown.
@@ -70,27 +72,28 @@ class SectionRows:
 
 
 def effects_gram(
-    part: SectionRows, velocities: Callable[[Array], Array], x: Array, single: Array, white: Array, slow: SlowErrors
+    section: SectionRows, velocities: Callable[[Array], Array], x: Array, single: Array, white: Array, slow: SlowErrors
 ) -> Array:
     """Return the Gram matrix (21 + k, 21 + k) of a section over [states, effects, residual], without slow errors.
 
-    velocities: see `SectionRows.with_effects`. x: (20,) point of linearisation. single, white: (3,) variances.
+    velocities: see `SectionRows.with_effects`.
+    x: (20,) point of linearisation.
+    single, white: (3,) variances.
     """
-    bins = part.with_effects(velocities).bins(single)
+    bins = section.with_effects(velocities).bins(single)
     k = bins.rows.shape[2] - WIDTH
-    gram = gram_of(bins, white, np.append(x, np.zeros(k)), part.slope_variance)
-    found: Array = Chain.begun(slow, k).after(gram, BLOCK_S, slow).ended().gram[0]
-    return found
+    gram = gram_of(bins, white, np.append(x, np.zeros(k)), section.slope_variance)
+    return np.asarray(Chain.begun(slow, k).after(gram, BLOCK_S, slow).ended().gram[0])
 
 
 def usual_square(values: Array) -> Array:
     """Return the variance (3,) of (J, 3) without nan, by the smaller 90 % of the squares, against outliers."""
-    found = np.zeros(3)
+    variance = np.zeros(3)
     for axis, column in enumerate(values.T):
         squares = np.sort(column[np.isfinite(column)] ** 2)
         kept = squares[: math.ceil(0.9 * len(squares))]
-        found[axis] = kept.mean() / TRIMMED_SQUARE if len(kept) else 0.0
-    return found
+        variance[axis] = kept.mean() / TRIMMED_SQUARE if len(kept) else 0.0
+    return variance
 
 
 def masked_median(values: Array) -> Array:

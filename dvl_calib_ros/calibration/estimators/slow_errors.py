@@ -4,6 +4,8 @@ A slow error is a first-order Gauss-Markov process, piecewise linear between kno
 condensed once to a Gram matrix over [slow errors at its start, at its end, states, residual]. This does not depend on
 the process's parameters. Given those, Schur complements eliminate the knots of a recording in order (a Kalman filter in
 information form). A section is held out by a zero Gram matrix; recordings add up after elimination.
+
+Shapes: C points of the prior of the slow errors, J references or bins.
 """
 
 from __future__ import annotations
@@ -57,8 +59,10 @@ class LogNormal(NamedTuple):
 class Priors:
     """Priors of the slow errors, from instrument specifications.
 
-    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: AHRS, rad.
-    memory: 10 to 300 s (90 %). deviation: heading deviation as a share of `heading_deviation_std`.
+    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s.
+    heading, tilt: AHRS, rad.
+    memory: 10 to 300 s (90 %).
+    deviation: heading deviation as a share of `heading_deviation_std`.
     """
 
     horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
@@ -80,13 +84,15 @@ def normal_points(k: int, n: int) -> Array:
         root = (1.0 + root) ** (1.0 / (k + 1))
     uniform = (0.5 + np.arange(n)[:, None] * (1.0 / root) ** np.arange(1, k + 1)) % 1.0
     normal = NormalDist()
-    return np.array([normal.inv_cdf(each) for each in uniform.ravel().tolist()]).reshape(n, k)
+    return np.array([normal.inv_cdf(share) for share in uniform.ravel().tolist()]).reshape(n, k)
 
 
 class Bins(NamedTuple):
     """Rows of one section averaged over bins of time.
 
-    rows: (J, 3, WIDTH), [slow at start, slow at end, states, residual]. weight: (J, 3). fold: (J,).
+    rows: (J, 3, WIDTH), [slow at start, slow at end, states, residual].
+    weight: (J, 3).
+    fold: (J,).
     """
 
     rows: Array
@@ -169,9 +175,9 @@ class Chain(NamedTuple):
     log_determinant: Array
 
     @staticmethod
-    def begun(slow: SlowErrors, more: int = 0) -> Chain:
-        """Return the chain before the first section. more: number of columns tested in addition to the states."""
-        width = SLOW + N_STATE + more + 1
+    def begun(slow: SlowErrors, n_tested: int = 0) -> Chain:
+        """Return the chain before the first section. n_tested: number of columns tested in addition to the states."""
+        width = SLOW + N_STATE + n_tested + 1
         gram = np.zeros((len(slow.std), width, width))
         gram[:, np.arange(SLOW), np.arange(SLOW)] = slow.std**-2.0
         return Chain(gram, 2.0 * np.log(slow.std).sum(axis=1))

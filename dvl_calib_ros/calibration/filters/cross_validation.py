@@ -3,6 +3,8 @@
 Blocks of `verification_block` are assigned to `FOLDS` folds in turn, so all folds cover the whole run. With Φ = I the
 information of samples is additive (kalman.py). One information matrix per fold and model is stored, and solving without
 a fold leaves it out: one pass, constant memory.
+
+Shapes: K models, N samples, n states.
 """
 
 from __future__ import annotations
@@ -92,10 +94,10 @@ class FoldInformation:
         """Start from x (K, n), P (K, n, n) of the filter."""
         self.begin([start.information] * FOLDS)
 
-    def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
+    def begin(self, information: Sequence[tuple[Array, Array]]) -> None:
         """Restart from Λ (K, n, n) and Λx (K, n) without each fold."""
-        self._begin = known
-        self._summed = FoldSums(known[0][0].shape, known[0][1].shape)
+        self._begin = information
+        self._summed = FoldSums(information[0][0].shape, information[0][1].shape)
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples where models used them (K, N)."""
@@ -148,9 +150,10 @@ def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np
 class MomentSums(NamedTuple):
     """Sums over samples with a reference that suffice to judge any correction.
 
-    samples: their number. vv (3, 3, 3), gv (3, 3): for each body axis, over samples whose reference measures it, Σ v vᵀ
-    and Σ g vᵀ. gg, noise: over all axes, Σ g² and Σ of the variance of R. v (3,) m/s is measured, DVL frame, at the
-    reference point; g m/s is the reference velocity along the axis.
+    samples: their number.
+    vv (3, 3, 3), gv (3, 3): for each body axis, over samples whose reference measures it, Σ v vᵀ and Σ g vᵀ.
+    gg, noise: over all axes, Σ g² and Σ of the variance of R. v (3,) m/s is measured, DVL frame, at the reference
+      point; g m/s is the reference velocity along the axis.
     """
 
     samples: Array | float
@@ -171,7 +174,7 @@ class Moments(FoldSums):
         return MomentSums(*(self.total if fold is None else self.of(fold)))
 
     def take(self, folds: NDArray[np.int64], observations: Observations) -> None:
-        """Add N samples."""
+        """Add N samples to the sums of their folds. folds: (N,) fold of each."""
         assert observations.reference_body is not None
         v, g = observations.velocity_at_reference, observations.reference_body
         measured = np.broadcast_to(observations.measured_in_body, v.shape)
@@ -201,12 +204,15 @@ class Moments(FoldSums):
 class HeldOutError:
     """Velocity error against the reference on held-out samples, m/s rms over the vector.
 
-    uncorrected: nominal mounting. corrected: estimate. predicted: expected value of corrected by R of the reference and
-    the covariance of the estimate. All include reference noise. calibration: contribution of the estimate to predicted.
+    uncorrected: nominal mounting.
+    corrected: estimate.
+    predicted: expected value of corrected by R of the reference and the covariance of the estimate. All include
+      reference noise.
+    calibration: contribution of the estimate to predicted.
     interpolated: white reference noise that corrected may contain beyond uncorrected: interpolation attenuates noise
-    between samples, and a delay changes the interpolation times. independent: equivalent number of independent samples;
-    None: samples. claimed: noise of reference and DVL by their messages, if predicted uses the noise estimated from the
-    data.
+      between samples, and a delay changes the interpolation times.
+    independent: equivalent number of independent samples; None: samples.
+    claimed: noise of reference and DVL by their messages, if predicted uses the noise estimated from the data.
     """
 
     samples: int
@@ -225,6 +231,8 @@ def held_out_error(
     """Return the error of a model on every fold by the state without it; None for too few samples.
 
     without: one state for each fold.
+    moments: sums over the samples of each fold.
+    rotation_dvl_from_body: (3, 3) nominal mounting.
     """
     samples = int(moments.in_fold(None).samples)
     if samples < FEWEST_SAMPLES or max(moments.in_fold(fold).samples for fold in range(FOLDS)) == samples:

@@ -2,6 +2,8 @@
 
 Switching models changes only which state is read, so a selected model has run from the start. The models of one `Group`
 are stacked and updated together, in blocks of any length.
+
+Shapes: K models, N samples, E requested states, n states.
 """
 
 from __future__ import annotations
@@ -101,8 +103,11 @@ def groups_of(
 class Group:
     """K models with equal observations that differ in z and H only.
 
-    needs: common to all. index: number k by name. n_given: samples received. next_row: for the caller, number of the
-    first row not yet passed. moments: of the samples, for the verification of models with a reference; else empty.
+    needs: common to all.
+    index: number k by name.
+    n_given: samples received.
+    next_row: for the caller, number of the first row not yet passed.
+    moments: of the samples, for the verification of models with a reference; else empty.
     """
 
     def __init__(
@@ -112,6 +117,12 @@ class Group:
         initial: Mapping[str, GaussianState] | None,
         verified: bool,
     ) -> None:
+        """Start the filters from their priors.
+
+        models: with equal needs, number of states and number of measured axes.
+        initial: initial states by model name.
+        verified: sum the information per fold for hold-out verification.
+        """
         self._parameters = parameters
         self._assembler = Assembler(models, parameters, initial)
         self._folds = FoldInformation(self._assembler.start) if verified else None
@@ -194,7 +205,11 @@ class Group:
         self._of_recording.clear()
 
     def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
-        """Update the models. A model with non-finite numbers keeps its previous state and is counted."""
+        """Update the models. A model with non-finite numbers keeps its previous state and is counted.
+
+        process: (N, K, n, n) covariance added before each sample, None for none.
+        ends: numbers of samples after which the states are returned, too.
+        """
         try:
             after = _filtered(self._x, self._p, data, process, ends)
             if _is_sound(after.x, after.p):
@@ -369,6 +384,6 @@ def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array]]:
         return
     except np.linalg.LinAlgError:
         pass  # one is singular: invert each alone
-    for each in zip(x, p, strict=True):
+    for state in zip(x, p, strict=True):
         with suppress(np.linalg.LinAlgError):
-            yield GaussianState(*each).information
+            yield GaussianState(*state).information

@@ -1,4 +1,7 @@
-"""Setup of the Kalman filter by models: initial state, rows, gates, and the meaning of its states."""
+"""Setup of the Kalman filter by models: initial state, rows, gates, and the meaning of its states.
+
+Shapes: K models, N samples, n states.
+"""
 
 from __future__ import annotations
 
@@ -20,25 +23,26 @@ from ..numerics.tests import chi2_cdf, chi2_isf
 class Assembler:
     """Measurements and states of K models with equal size and noise that differ in z and H only.
 
-    start: initial x (K, n), P (K, n, n): the prior, or `initial` by model name. prior: of all models (also used for
-    states that differ per recording). process_rate: Q per second (K, n, n), a random walk of misalignment and scale,
-    not of nuisance states; None without.
+    start: initial x (K, n), P (K, n, n): the prior, or `initial` by model name.
+    prior: of all models (also used for states that differ per recording).
+    process_rate: Q per second (K, n, n), a random walk of misalignment and scale, not of nuisance states; None without.
     """
 
     def __init__(
         self, models: Sequence[Model], parameters: Parameters, initial: Mapping[str, GaussianState] | None = None
     ) -> None:
+        """Stack the models' priors, gates and process noise. initial: states by model name, instead of the priors."""
         self.models = tuple(models)
         first = self.models[0]
         self._n, self._m, self._model_noise = first.n_state, first.n_measurement, first.noise
         self._motion_is_noise = first.motion_is_noise
         priors = [prior(model, parameters) for model in self.models]
-        self.prior = GaussianState(np.array([each.x for each in priors]), np.array([each.p for each in priors]))
-        given = initial or {}
-        self._starts = [given.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
-        self._floors = [_floor(model, parameters) for model in self.models]
-        held = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
-        self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
+        self.prior = GaussianState(np.array([begin.x for begin in priors]), np.array([begin.p for begin in priors]))
+        initial = initial or {}
+        self._starts = [initial.get(model.name) or begin for model, begin in zip(self.models, priors, strict=True)]
+        self._floors = [_floor(model, parameters) for model in self.models]  # covariance that no data reduce
+        starts = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
+        self.start = GaussianState(np.array([state.x for state in starts]), np.array([state.p for state in starts]))
         # gate by the number of unmeasured axes
         self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m + 1)])
         self._gate = np.full((len(self.models), 1), self._gates[0])
@@ -91,16 +95,17 @@ class Assembler:
         gate = np.repeat(self._gate, n_samples, axis=1)
         for index, model in enumerate(self.models):
             axes = _dropped_axes(model, unmeasured)
-            at = np.flatnonzero(axes.any(axis=1))
-            if not len(at):
+            affected = np.flatnonzero(axes.any(axis=1))
+            if not len(affected):
                 continue
-            turned = unmeasured.rotation_reference_from_body[at] @ observations.rotation_dvl_from_body.T
-            kept = ~axes[at]
-            z[index, at] = np.einsum("nij,nj->ni", turned, z[index, at]) * kept
-            h[index, at] = turned @ h[index, at] * kept[:, :, None]
-            r = turned @ noise[index, at] @ turned.swapaxes(1, 2) * (kept[:, :, None] & kept[:, None, :])
-            noise[index, at] = r + np.eye(3) * axes[at, None, :]
-            gate[index, at] = self._gates[axes[at].sum(axis=1)]
+            turned = unmeasured.rotation_reference_from_body[affected] @ observations.rotation_dvl_from_body.T
+            is_measured = ~axes[affected]
+            z[index, affected] = np.einsum("nij,nj->ni", turned, z[index, affected]) * is_measured
+            h[index, affected] = turned @ h[index, affected] * is_measured[:, :, None]
+            both_measured = is_measured[:, :, None] & is_measured[:, None, :]
+            r = turned @ noise[index, affected] @ turned.swapaxes(1, 2) * both_measured
+            noise[index, affected] = r + np.eye(3) * axes[affected, None, :]
+            gate[index, affected] = self._gates[axes[affected].sum(axis=1)]
         return noise, gate
 
 
@@ -136,7 +141,7 @@ LEAST_STD = 1e-7
 def prior(model: Model, parameters: Parameters) -> GaussianState:
     """Return zero errors with the prior standard deviations of the parameters."""
     std = [parameters.initial_std_misalignment] * 3 + [parameters.initial_std_scale] * (model.n_errors - 3)
-    std += [getattr(parameters, each.std) if isinstance(each.std, str) else each.std for each in model.nuisance]
+    std += [getattr(parameters, spec.std) if isinstance(spec.std, str) else spec.std for spec in model.nuisance]
     return GaussianState(np.zeros(model.n_state), np.diag(np.square(np.maximum(std, LEAST_STD))))
 
 

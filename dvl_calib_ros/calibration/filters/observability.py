@@ -55,9 +55,11 @@ class PredictedDrift(NamedTuple):
 class Observability(NamedTuple):
     """Observability of one parameter of one model.
 
-    std: standard deviation (rad, dimensionless, m or s). observed: the data halved the prior σ. axis: the body axis
-    (roll, pitch, yaw) of an angle's uncertainty, scale (across), or the name in words. missing: required motion, ''
-    once observed. progress: logarithmic share of the way from the prior σ (0) to the fine threshold (1).
+    std: standard deviation (rad, dimensionless, m or s).
+    observed: the data halved the prior σ.
+    axis: the body axis (roll, pitch, yaw) of an angle's uncertainty, scale (across), or the name in words.
+    missing: required motion, '' once observed.
+    progress: logarithmic share of the way from the prior σ (0) to the fine threshold (1).
     """
 
     name: str

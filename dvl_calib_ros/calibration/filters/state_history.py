@@ -1,4 +1,7 @@
-"""History of the model states, thinned to constant memory."""
+"""History of the model states, thinned to constant memory.
+
+Shapes: K models, E rows of samples, n states.
+"""
 
 from __future__ import annotations
 
@@ -70,13 +73,13 @@ class StateTrace:
             kept[number] = after.row(index)
         while max(map(len, self._kept.values())) > self._limit:
             self._stride *= 2
-            for each in self._kept.values():
-                for number in [number for number in each if number % self._stride]:
-                    del each[number]
+            for snapshots in self._kept.values():
+                for number in [number for number in snapshots if number % self._stride]:
+                    del snapshots[number]
 
     def numbers(self) -> Numbers:
         """Return the rows (E) with states of all models."""
-        common = set.intersection(*(set(each) for each in self._kept.values()))
+        common = set.intersection(*(set(snapshots) for snapshots in self._kept.values()))
         return np.array(sorted(number for number in common if number % self._stride == 0), dtype=np.int64)
 
     def snapshot(self, group: Hashable, numbers: Numbers) -> Snapshot:

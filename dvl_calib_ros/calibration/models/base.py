@@ -38,9 +38,10 @@ class Needs(Enum):
 class Nuisance(NamedTuple):
     """State that is estimated only to keep its effect out of misalignment and scale.
 
-    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. per_recording: the
-    value differs per recording. handed_on: a result file passes it on as a prior, even if it differs per recording,
-    because a restarted node usually continues the same recording.
+    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it.
+    per_recording: the value differs per recording.
+    handed_on: a result file passes it on as a prior, even if it differs per recording, because a restarted node usually
+      continues the same recording.
     """
 
     name: str
@@ -54,17 +55,22 @@ class Nuisance(NamedTuple):
 class Model:
     """Calibration model: required input, measurement equation, states and filter options.
 
-    linearise: observations -> z (N, m), H (N, m, n). shown_by: for the operator, the motion that makes roll, pitch, yaw
-    and scale observable. assumes, wrong_when: for the documentation. scale_axes: name of each scale state and the DVL
-    axes that it acts on. needs_prior: uses prior sway and heave.
+    linearise: observations -> z (N, m), H (N, m, n).
+    shown_by: for the operator, the motion that makes roll, pitch, yaw and scale observable.
+    assumes, wrong_when: for the documentation.
+    scale_axes: name of each scale state and the DVL axes that it acts on.
+    needs_prior: uses prior sway and heave.
 
-    Filter options. noise: observations -> R (N or 1, 3, 3) (m/s)², of which a model with fewer rows uses the first
-    ones; None: `Observations.noise`. motion_is_noise: vehicle motion is the noise, so samples have the weight
-    `Observations.motion_weight`. vertical_from_reference: uses the vertical velocity of the reference as a measurement.
-    estimator: "module:class" of its `Estimator`, '' for the linear filter. sideslip_std: σ (rad) about the body's yaw
-    axis that P includes because no data of this model reduce it; 0: none. uses_height: uses `Observations.height`.
-    from_positions: uses positions instead of velocities derived from them; `auto` selects it
-    where the derived velocities are too noisy.
+    Filter options.
+    noise: observations -> R (N or 1, 3, 3) (m/s)², of which a model with fewer rows uses the first ones; None:
+      `Observations.noise`.
+    motion_is_noise: vehicle motion is the noise, so samples have the weight `Observations.motion_weight`.
+    vertical_from_reference: uses the vertical velocity of the reference as a measurement.
+    estimator: "module:class" of its `Estimator`, '' for the linear filter.
+    sideslip_std: σ (rad) about the body's yaw axis that P includes because no data of this model reduce it; 0: none.
+    uses_height: uses `Observations.height`.
+    from_positions: uses positions instead of velocities derived from them; `auto` selects it where the derived
+      velocities are too noisy.
     """
 
     name: str
@@ -98,7 +104,7 @@ class Model:
     @cached_property
     def state_names(self) -> tuple[str, ...]:
         """Names of the states in order: misalignment (rad), scale-factor errors (dimensionless), nuisance states."""
-        scales, nuisance = (name for name, _ in self.scale_axes), (each.name for each in self.nuisance)
+        scales, nuisance = (name for name, _ in self.scale_axes), (spec.name for spec in self.nuisance)
         return (*MISALIGNMENT_STATES, *scales, *nuisance)
 
     @property
@@ -109,15 +115,15 @@ class Model:
     @cached_property
     def of_day(self) -> NDArray[np.intp]:
         """Indices (u,) of the states that differ per recording (`Nuisance.per_recording`)."""
-        return self._nuisance_that(lambda each: each.per_recording)
+        return self._nuisance_that(lambda spec: spec.per_recording)
 
     @cached_property
     def not_handed_on(self) -> NDArray[np.intp]:
         """Indices (u,) of the states that a result file does not pass on (`Nuisance.handed_on`)."""
-        return self._nuisance_that(lambda each: not each.handed_on)
+        return self._nuisance_that(lambda spec: not spec.handed_on)
 
     def _nuisance_that(self, is_so: Callable[[Nuisance], bool]) -> NDArray[np.intp]:
-        return np.array([self.n_errors + i for i, each in enumerate(self.nuisance) if is_so(each)], dtype=np.intp)
+        return np.array([self.n_errors + i for i, spec in enumerate(self.nuisance) if is_so(spec)], dtype=np.intp)
 
     @cached_property
     def error_terms_from_state(self) -> Array:
@@ -185,15 +191,19 @@ class Reference(NamedTuple):
 class Observations:
     """Block of N synchronised samples with everything a model may use; derived quantities are computed once.
 
-    velocity_dvl: (N, 3) m/s measured, DVL frame. reference_body: (N, 3) m/s reference velocity of the reference point,
-    body frame; None without a reference. lever_velocity: (N, 3) m/s, ω×l of the DVL, body frame, zero where unknown;
-    None without a lever arm. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and heave, body frame.
-    noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame. rotation_enu_from_body: (N, 3, 3), and
-    angular_velocity: (N, 3) rad/s, body frame; None without attitude, identity and zero where not oriented (N,).
+    velocity_dvl: (N, 3) m/s measured, DVL frame.
+    reference_body: (N, 3) m/s reference velocity of the reference point, body frame; None without a reference.
+    lever_velocity: (N, 3) m/s, ω×l of the DVL, body frame, zero where unknown; None without a lever arm.
+    rotation_dvl_from_body: T (3, 3).
+    sway_heave: (2,) m/s prior sway and heave, body frame.
+    noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame.
+    rotation_enu_from_body: (N, 3, 3), and angular_velocity: (N, 3) rad/s, body frame; None without attitude, identity
+      and zero where not oriented (N,).
     interval: (N,) s since the previous DVL sample.
     unmeasured: axes of the reference that hold the DVL's own velocity (nominal mounting) because they are not measured;
-    None if all are measured. earth_in_body: (N, 3, 2) east and north as columns in the body frame, the axes of a
-    constant error of an earth-frame reference; zeros for samples with a body-frame reference, None if all have one.
+      None if all are measured.
+    earth_in_body: (N, 3, 2) east and north as columns in the body frame, the axes of a constant error of an earth-frame
+      reference; zeros for samples with a body-frame reference, None if all have one.
     height: (N,) m since the last dropout, None unless the model uses it.
     """
 

@@ -22,7 +22,7 @@ UPRIGHT = 0.5
 _AHEAD = np.array([1.0, 0.0, 0.0])
 
 
-def _unaided(seen: Observations) -> Linearised:
+def _unaided(observed: Observations) -> Linearised:
     """Linearise `unaided`: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h, s, a (docs/models.md).
 
     (Tᵀ(v + [v×]φ))_y = (Rᵀ(c + s z))_y + b ω_z u: current c with shear s over height z, skid b in turns. On one heading
@@ -33,35 +33,35 @@ def _unaided(seen: Observations) -> Linearised:
     Samples without attitude have a constant sway a instead, and of [v×] the forward part only: in turns, sway and heave
     vary together and would look like roll.
     """
-    rotation, rates = seen.rotation_enu_from_body, seen.angular_velocity
-    oriented, v = seen.oriented, seen.velocity_in_body
+    rotation, rates = observed.rotation_enu_from_body, observed.angular_velocity
+    oriented, v = observed.oriented, observed.velocity_in_body
     assert rotation is not None and rates is not None and oriented is not None
     up = rotation[:, 2]
     upright = oriented & (np.abs(up[:, 2]) > UPRIGHT)
     level_heave = np.where(upright, -(up[:, 0] * v[:, 0] + up[:, 1] * v[:, 1]) / np.where(upright, up[:, 2], 1.0), 0.0)
     h = np.zeros((len(v), 2, 11))
-    h[:, :, :3] = -(skew(np.where(oriented[:, None], v, v * _AHEAD)) @ seen.rotation_dvl_from_body.T)[:, 1:]
+    h[:, :, :3] = -(skew(np.where(oriented[:, None], v, v * _AHEAD)) @ observed.rotation_dvl_from_body.T)[:, 1:]
     across = rotation[:, :2, 1] * oriented[:, None]
     h[:, 0, 3:5] = across
     h[:, 0, 5] = rates[:, 2] * v[:, 0]
     h[:, 1, 6] = level_heave
     h[:, 1, 7] = 1.0
-    if seen.height is not None:
-        h[:, 0, 8:10] = across * seen.height[:, None]
+    if observed.height is not None:
+        h[:, 0, 8:10] = across * observed.height[:, None]
     h[:, 0, 10] = ~oriented
     z = v[:, 1:].copy()
     z[:, 1] -= level_heave
     return z, h
 
 
-def _unaided_noise(seen: Observations) -> Array:
+def _unaided_noise(observed: Observations) -> Array:
     """Return R (N, 3, 3) (m/s)² of `unaided`: sway and heave grow with the turn rate."""
-    assert seen.angular_velocity is not None and seen.oriented is not None
-    turn = seen.angular_velocity[:, 2] * seen.velocity_in_body[:, 0]
+    assert observed.angular_velocity is not None and observed.oriented is not None
+    turn = observed.angular_velocity[:, 2] * observed.velocity_in_body[:, 0]
     noise = np.zeros((len(turn), 3, 3))
-    noise[:, 0, 0] = np.where(seen.oriented, TURN_SWAY_STD_S * turn, UNSEEN_TURN_SWAY_STD) ** 2
+    noise[:, 0, 0] = np.where(observed.oriented, TURN_SWAY_STD_S * turn, UNSEEN_TURN_SWAY_STD) ** 2
     noise[:, 1, 1] = (TURN_HEAVE_STD_S * turn) ** 2
-    noise += seen.assumptions.motion_std**2 * np.eye(3)
+    noise += observed.assumptions.motion_std**2 * np.eye(3)
     return noise
 
 
@@ -106,22 +106,22 @@ def heading_cycles(rotation_enu_from_body: Array) -> Array:
     return np.stack([np.sin(heading), np.cos(heading), np.sin(2.0 * heading), np.cos(2.0 * heading)], axis=1)
 
 
-def linearise_full(seen: Observations) -> Linearised:
+def linearise_full(observed: Observations) -> Linearised:
     """Linearise `full` at zero errors: z = g - T'v (N, 3) and H (N, 3, 20), body frame."""
-    assert seen.reference_body is not None
-    body_from_dvl = seen.rotation_dvl_from_body.T
-    h = np.zeros((len(seen.velocity_dvl), 3, N_STATE))
-    h[:, :, PHI] = turned_skew(body_from_dvl, seen.velocity_dvl.T).transpose(2, 0, 1)
-    h[:, :, SCALE] = -body_from_dvl[:, :2] * seen.velocity_dvl[:, None, :2]
+    assert observed.reference_body is not None
+    body_from_dvl = observed.rotation_dvl_from_body.T
+    h = np.zeros((len(observed.velocity_dvl), 3, N_STATE))
+    h[:, :, PHI] = turned_skew(body_from_dvl, observed.velocity_dvl.T).transpose(2, 0, 1)
+    h[:, :, SCALE] = -body_from_dvl[:, :2] * observed.velocity_dvl[:, None, :2]
     h[:, :, BIAS] = -body_from_dvl
-    if seen.angular_velocity is not None:
-        h[:, :, LEVER_ARM] = -skew(seen.angular_velocity)
-    if seen.earth_in_body is not None and seen.rotation_enu_from_body is not None:
-        h[:, :, REFERENCE_ERROR] = seen.rotation_enu_from_body.transpose(0, 2, 1)
-        up = seen.rotation_enu_from_body[:, 2]
-        across = np.cross(up, seen.velocity_in_body)
-        h[:, :, HEADING] = across[:, :, None] * heading_cycles(seen.rotation_enu_from_body)[:, None]
-    return seen.reference_body - seen.velocity_in_body, h
+    if observed.angular_velocity is not None:
+        h[:, :, LEVER_ARM] = -skew(observed.angular_velocity)
+    if observed.earth_in_body is not None and observed.rotation_enu_from_body is not None:
+        h[:, :, REFERENCE_ERROR] = observed.rotation_enu_from_body.transpose(0, 2, 1)
+        up = observed.rotation_enu_from_body[:, 2]
+        across = np.cross(up, observed.velocity_in_body)
+        h[:, :, HEADING] = across[:, :, None] * heading_cycles(observed.rotation_enu_from_body)[:, None]
+    return observed.reference_body - observed.velocity_in_body, h
 
 
 # Motion that makes the published nuisance states observable, by state.
@@ -163,16 +163,16 @@ FULL = Model(
 )  # fmt: skip
 
 
-def _per_second(seen: Observations) -> Linearised:
+def _per_second(observed: Observations) -> Linearised:
     """Linearise the displacement rate of `positions`: z = -Tᵀv, H = [Tᵀ[v×], -Tᵀv] on φ and δk.
 
     `legs` integrates both over time.
     """
-    t, v = seen.rotation_dvl_from_body.T, seen.velocity_dvl
+    t, v = observed.rotation_dvl_from_body.T, observed.velocity_dvl
     h = np.empty((len(v), 3, 4))
     h[:, :, :3] = turned_skew(t, v.T).transpose(2, 0, 1)
-    h[:, :, 3] = -seen.velocity_in_body
-    return -seen.velocity_in_body, h
+    h[:, :, 3] = -observed.velocity_in_body
+    return -observed.velocity_in_body, h
 
 
 POSITIONS = Model(

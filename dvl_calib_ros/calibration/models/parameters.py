@@ -148,7 +148,7 @@ class Parameters:
         True, "Take default mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description."
     )
     publish_tf: bool = _parameter(
-        False, "Broadcast ~/mounting as a static transform (needs tf2_ros). Not next to another publisher of it."
+        False, "Broadcast ~/mounting as a static transform (needs tf2_ros), if no other node does so."
     )
     dvl_frame: str = _parameter(
         "", "frame_id that DVL messages must carry. Empty: the first one that is neither body nor earth."
@@ -187,7 +187,7 @@ class Parameters:
     )
     reference_position: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
-        "Position of the reference point (antenna, INS) in base_frame; plus the lever arm it is the DVL's.",
+        "Position of the reference point (antenna, INS) in base_frame. The DVL is at this plus lever_arm.",
         unit="m",
         within=(-100.0, 100.0),
     )
@@ -216,7 +216,7 @@ class Parameters:
         unit="rad",
         within=(-2 * math.pi, 2 * math.pi),
     )
-    restamp: str = _parameter("", "Topics whose stamps are replaced by recording times, with commas between; log: all.")
+    restamp: str = _parameter("", "Topics whose stamps are replaced by recording times, separated by commas. log: all.")
     dvl_time_offset: float = _parameter(
         0.0, "Delay of DVL stamps (positive: late), corrected before pairing.", unit="s", within=(-60.0, 60.0)
     )
@@ -248,7 +248,7 @@ class Parameters:
     initial_std_scale: float = _parameter(0.006, "Prior σ of the scale error.", within=(1e-7, 0.5))
     initial_std_lever_arm: float = _parameter(
         2.0,
-        "Prior σ of the lever arm (full). A configured arm has 0.05 m, or with probability 0.1 this.",
+        "Prior σ of the lever arm (full). A configured arm has σ 0.05 m, or this with probability 0.1.",
         unit="m",
         within=(1e-4, 100.0),
     )
@@ -259,7 +259,7 @@ class Parameters:
         0.0, "Random walk of each misalignment angle.", unit="rad/√s", within=(0.0, 0.1)
     )
     process_std_scale: float = _parameter(0.0, "Random walk of the scale error.", unit="1/√s", within=(0.0, 0.1))
-    use_message_covariance: bool = _parameter(True, "R of the GNSS models from message covariances.")
+    use_message_covariance: bool = _parameter(True, "Take R of the GNSS models from the covariances in messages.")
     gnss_aided_std: float = _parameter(
         0.2, "σ per axis of R of the GNSS models, if the reference has no covariance.", unit="m/s", within=(1e-4, 10.0)
     )
@@ -304,13 +304,13 @@ class Parameters:
     )
     day_std_heading: float = _parameter(
         math.radians(0.1),
-        "Heading error that differs by day, in σ of yaw (0.1°: gyrocompass; magnetic compass: 1° and more).",
+        "σ of the heading error that differs between days (0.1°: gyrocompass; magnetic compass: 1° and more).",
         unit="rad",
         within=(0.0, 0.5),
     )
     day_std_scale: float = _parameter(
         0.003,
-        "Scale difference between days, in σ of scale (0.3 %: 4.5 m/s of the speed of sound, or 1.5 °C).",
+        "σ of the scale difference between days (0.3 %: 4.5 m/s of the speed of sound, or 1.5 °C).",
         within=(0.0, 0.5),
     )
     current_std: float = _parameter(
@@ -335,7 +335,7 @@ class Parameters:
     )
     min_speed: float = _parameter(0.3, "Slower samples are not used. 0: off.", unit="m/s", within=(0.0, 10.0))
     max_turn_rate: float = _parameter(
-        0.0, "Samples above it, or without angular velocity, are not used. 0: off.", unit="rad/s", within=(0.0, 10.0)
+        0.0, "Samples that turn faster or lack angular velocity are not used. 0: off.", unit="rad/s", within=(0.0, 10.0)
     )
     max_repeats: float = _parameter(
         0.0,
@@ -354,13 +354,13 @@ class Parameters:
     )
     max_latency: float = _parameter(
         1.0,
-        "Stamp difference by which a topic may lag before a DVL sample continues without it.",
+        "Longest time that a DVL sample waits for a topic, by stamps; then it is used without that topic.",
         unit="s",
         within=(0.0, 600.0),
     )
     max_time_jump: float = _parameter(
         10.0,
-        "A larger step between stamps needs a second sample; backward it restarts the calibration.",
+        "A larger step between stamps is used if the next sample confirms it; backward it restarts the calibration.",
         unit="s",
         within=(0.1, 86400.0),
     )
@@ -377,7 +377,7 @@ class Parameters:
     )
     target_drift: float = _parameter(
         2.0,
-        "Predicted drift of a fine calibration: good enough. Up to five times it is accepted.",
+        "Predicted drift at which a calibration is good enough; up to five times this value is accepted.",
         unit="m/km",
         within=(0.01, 1000.0),
         read_only=False,
@@ -386,25 +386,25 @@ class Parameters:
         10.0, "Length of the blocks of hold-out verification.", unit="s", within=(0.1, 3600.0)
     )
     accept_misalignment: float = _parameter(
-        math.radians(2.0), "A misalignment above this (2°) is marginal ...", unit="rad", within=(0.0, math.pi)
+        math.radians(2.0), "A misalignment above this (2°) is marginal.", unit="rad", within=(0.0, math.pi)
     )
     reject_misalignment: float = _parameter(
-        math.radians(5.0), "... and from this (5°) on rejected.", unit="rad", within=(0.0, math.pi)
+        math.radians(5.0), "A misalignment of this (5°) or more is rejected.", unit="rad", within=(0.0, math.pi)
     )
     max_scale_error: float = _parameter(0.05, "A larger scale error is rejected.", within=(0.0, 1.0))
     max_error_ratio: float = _parameter(
         1.0,
-        "Significantly above this ratio of held-out to predicted error a calibration is marginal.",
+        "A calibration is marginal if held-out error / predicted error is significantly above this.",
         within=(0.1, 100.0),
     )
     result_file: str = _parameter(
         "",
-        "Result file (YAML) of ~/save and the end of the node. At run time only another .yaml in the same folder.",
+        "Result file (YAML) of ~/save and the end of the node. A running node accepts only a .yaml in the same folder.",
         read_only=False,
     )
     result_backups: float = _parameter(
         3.0,
-        "Earlier results kept: .bak is the last, .bak.2 and on the best converged.",
+        "Number of earlier results kept: .bak is the last, .bak.2 and higher are the best converged.",
         within=(1.0, 100.0),
         read_only=False,
     )

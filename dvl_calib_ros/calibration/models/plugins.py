@@ -21,16 +21,16 @@ from .base import Model
 ENTRY_POINTS = "dvl_calib_ros.models"
 
 
-def plugged_models(own: Mapping[str, Model]) -> tuple[dict[str, Model], list[str]]:
+def plugged_models(builtin: Mapping[str, Model]) -> tuple[dict[str, Model], list[str]]:
     """Return the models of other packages by name, and an error message for each unusable one.
 
-    own: models that exist already.
+    builtin: models of this package.
     """
     models: dict[str, Model] = {}
     problems = []
     for name, value in _points():
         try:
-            models.update(_loaded(name, value, {**own, **models}))
+            models.update(_loaded(name, value, {**builtin, **models}))
         except InputError as error:
             problems.append(str(error))
     return models, problems
@@ -44,13 +44,13 @@ def load(name: str) -> object:
     return getattr(import_module(module), attribute)
 
 
-def _loaded(name: str, value: str, known: Mapping[str, Model]) -> dict[str, Model]:
+def _loaded(name: str, value: str, existing: Mapping[str, Model]) -> dict[str, Model]:
     """Return the model of an entry point by its name. Raises InputError for any fault of its package."""
     try:
         model = load(value)
         if not isinstance(model, Model):
             raise TypeError(f"{value} is no Model")
-        if model.name in known:
+        if model.name in existing:
             raise ValueError(f"there is a model {model.name!r} already; give it another name")
     except Exception as error:  # another package may raise any error
         raise InputError(

@@ -14,34 +14,34 @@ from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Obse
 
 
 def _gnss_aided(
-    scale_axes: tuple[tuple[str, tuple[int, ...]], ...], heave_is_zero: bool, seen: Observations
+    scale_axes: tuple[tuple[str, tuple[int, ...]], ...], heave_is_zero: bool, observed: Observations
 ) -> Linearised:
     """Linearise M1-M4: z = r - v, H = [r×, -r on the scaled axes]."""
-    r, r_skew = seen.reference_without_heave if heave_is_zero else seen.reference
+    r, r_skew = observed.reference_without_heave if heave_is_zero else observed.reference
     h = np.zeros((len(r), 3, 3 + len(scale_axes)))
     h[:, :, :3] = r_skew
     for column, (_, axes) in enumerate(scale_axes, start=3):
         for axis in axes:
             h[:, axis, column] = -r[:, axis]
-    return r - seen.velocity_dvl, h
+    return r - observed.velocity_dvl, h
 
 
-def _m5(seen: Observations) -> Linearised:
+def _m5(observed: Observations) -> Linearised:
     """Linearise M5: z = r - v, H = [r×], r = T (‖v‖, s, h)."""
-    r = seen.speed_and_prior @ seen.rotation_dvl_from_body.T
-    return r - seen.velocity_at_reference, skew(r)
+    r = observed.speed_and_prior @ observed.rotation_dvl_from_body.T
+    return r - observed.velocity_at_reference, skew(r)
 
 
-def _m6(seen: Observations) -> Linearised:
+def _m6(observed: Observations) -> Linearised:
     """Linearise M6: z = (‖v‖, s, h) - Tᵀv, H = Tᵀ[v×], body frame."""
-    z = seen.speed_and_prior - seen.velocity_in_body
-    return z, seen.body_from_measured
+    z = observed.speed_and_prior - observed.velocity_in_body
+    return z, observed.body_from_measured
 
 
-def _m7(seen: Observations) -> Linearised:
+def _m7(observed: Observations) -> Linearised:
     """Linearise M7: z = ‖v‖ - (Tᵀv)_x, H = first row of Tᵀ[v×]."""
-    z = seen.speed - seen.velocity_in_body[:, 0]
-    return z[:, None], seen.body_from_measured[:, :1]
+    z = observed.speed - observed.velocity_in_body[:, 0]
+    return z[:, None], observed.body_from_measured[:, :1]
 
 
 _ONE_SCALE = (("delta_k", (0, 1, 2)),)

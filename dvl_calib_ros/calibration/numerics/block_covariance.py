@@ -4,6 +4,8 @@ The covariance of a filter assumes white noise R. Larger or correlated noise and
 more. With Λ_b, y_b the information of block b (Λ = Λ₀ + Σ Λ_b), its score s_b = y_b - Λ_b x at the common estimate x
 has covariance Λ_b under the model. The actual scatter Σ s_b s_bᵀ gives the "sandwich" covariance P (Λ₀ + Σ s_b s_bᵀ) P
 (White, "Maximum likelihood estimation of misspecified models", 1982).
+
+Shapes: K models, B blocks of time, S estimates, n states.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ MIN_LASTING_BLOCKS, LASTING_Z, MAX_CORRELATION = 16, 1.5, 0.85
 class TimeBlocks:
     """Information of consecutive time blocks, for K hypotheses or models.
 
-    count: number of blocks. weight: equivalent number of samples. total: sums Λ (K, n, n) and y (K, n), read-only.
+    count: number of blocks.
+    weight: equivalent number of samples.
+    total: sums Λ (K, n, n) and y (K, n), read-only.
     """
 
     def __init__(self) -> None:
@@ -46,7 +50,7 @@ class TimeBlocks:
         self._vector = np.zeros((0, 0, 0))
         self.total: tuple[Array, Array] = np.zeros((0, 0, 0)), np.zeros((0, 0))
         self.count = 0
-        self._each = 1  # additions in a full block
+        self._per_block = 1  # additions in a full block
         self._in_last = 0
         self.weight = 0.0
 
@@ -56,10 +60,15 @@ class TimeBlocks:
         return self._information[: self.count], self._vector[: self.count]
 
     def add(self, information: Array, vector: Array, weight: float) -> None:
-        """Add the information of a stretch: Λ_b (K, n, n), y_b (K, n). weight: equivalent number of samples."""
+        """Add the information of a stretch to the newest block, or to a new one if that is full.
+
+        At MAX_BLOCKS blocks, neighbours are joined and a full block holds twice as many stretches.
+
+        information, vector: Λ_b (K, n, n) and y_b (K, n). weight: equivalent number of samples.
+        """
         self.weight += weight
         self.total = (self.total[0] + information, self.total[1] + vector) if self.count else (information, vector)
-        if self.count and self._in_last < self._each:
+        if self.count and self._in_last < self._per_block:
             self._information[self.count - 1] += information
             self._vector[self.count - 1] += vector
             self._in_last += 1
@@ -70,9 +79,9 @@ class TimeBlocks:
             self._vector = np.full((MAX_BLOCKS, *vector.shape), np.nan)
         if self.count == MAX_BLOCKS:
             self.count = MAX_BLOCKS // 2
-            for each in (self._information, self._vector):
-                each[: self.count] = each[0::2] + each[1::2]
-            self._each *= 2
+            for sums in (self._information, self._vector):
+                sums[: self.count] = sums[0::2] + sums[1::2]
+            self._per_block *= 2
         self._information[self.count], self._vector[self.count] = information, vector
         self.count += 1
         self._in_last = 1
@@ -80,8 +89,9 @@ class TimeBlocks:
     def end_day(self, of_day: NDArray[np.intp], information: Array, vector: Array, source: NDArray[np.intp]) -> None:
         """Reduce the blocks to the states that continue in the next recording.
 
-        of_day: indices (u,) of the other states. information (K, n, n), vector (K, n): total. source: (K,) index of the
-        hypothesis whose past each one takes.
+        of_day: indices (u,) of the other states.
+        information (K, n, n), vector (K, n): total.
+        source: (K,) index of the hypothesis whose past each one takes.
         """
         if not len(of_day):
             return
@@ -108,7 +118,7 @@ class TimeBlocks:
         """Return the blocks of one of the K."""
         if not self.count:
             return BlocksOfOne(np.zeros((0, 0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
-        information, vector = (each[:, index].copy() for each in self.kept)
+        information, vector = (sums[:, index].copy() for sums in self.kept)
         return BlocksOfOne(information, vector, self.total[0][index])
 
     def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTING_Z, rarely: float | None = RARE) -> Array:
@@ -138,12 +148,12 @@ def inflations(
     """
     variance = np.diagonal(p, axis1=1, axis2=2)
     factor = np.ones(variance.shape)
-    counts = np.array([len(each.vector) for each in blocks])
+    counts = np.array([len(block.vector) for block in blocks])
     for count in sorted(set(counts[counts >= MIN_BLOCKS].tolist())):
         chosen = np.flatnonzero(counts == count)
         own = [(blocks[number], x[number]) for number in chosen.tolist()]
-        scores = np.stack([each.vector - each.information @ estimate for each, estimate in own])
-        information = np.stack([each.information for each, _ in own])
+        scores = np.stack([blocks.vector - blocks.information @ estimate for blocks, estimate in own])
+        information = np.stack([blocks.information for blocks, _ in own])
         # share of each block in the claimed variance of each quantity (S, m, r)
         shares = np.einsum("srn,smnk,srk->smr", p[chosen], information, p[chosen], optimize=True)
         factor[chosen] = _inflations(scores, shares, p[chosen], variance[chosen], lasts, rarely)
@@ -168,7 +178,7 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
         # the prior part of P is not judged by the data
         ratio = 1.0 + excess / np.maximum(variance, 1e-300)
         factor = np.maximum(factor, np.where(observed > by_chance, np.sqrt(np.maximum(ratio, 1.0)), 1.0))
-        scores, parts = (_paired(each) for each in (scores, parts))
+        scores, parts = (_paired(values) for values in (scores, parts))
     return factor
 
 

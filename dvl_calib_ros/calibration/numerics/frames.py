@@ -136,7 +136,7 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
         q[j] = r[j][i] + r[i][j]
         q[k] = r[k][i] + r[i][k]
     norm = math.sqrt(np.dot(q, q))
-    x, y, z, w = (each / norm if q[3] >= 0.0 else -(each / norm) for each in q)
+    x, y, z, w = (term / norm if q[3] >= 0.0 else -(term / norm) for term in q)
     return x, y, z, w
 
 
@@ -176,9 +176,9 @@ def slerps(q0: Array, q1: Array, fraction: Array) -> Array:
     sign = np.where(dot >= 0.0, 1.0, -1.0)
     dot = np.minimum(np.abs(dot), 1.0)
     angle = np.arccos(np.where(dot > _SHORT_ARC, 0.0, dot))
-    whole = np.sin(angle)
-    w0 = np.where(dot > _SHORT_ARC, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / whole)
-    w1 = sign * np.where(dot > _SHORT_ARC, fraction, np.sin(fraction * angle) / whole)
+    sine = np.sin(angle)
+    w0 = np.where(dot > _SHORT_ARC, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / sine)
+    w1 = sign * np.where(dot > _SHORT_ARC, fraction, np.sin(fraction * angle) / sine)
     mixed = q0 * w0[:, None] + q1 * w1[:, None]
     unit: Array = mixed / np.sqrt(squared(mixed))[:, None]
     return unit

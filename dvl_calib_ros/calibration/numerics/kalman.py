@@ -68,9 +68,12 @@ def covariance_of(information: Array, prior: Array) -> Array:
 class Measurements:
     """N measurements of m rows for each of K models with n states.
 
-    z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N),
-    information weight of a sample, in 0..1 (below 1 for samples that share noise). usable: (K, N), False where a model
-    must not use a sample. gate: (K or 1, N or 1), largest accepted normalised innovation squared, inf without gate.
+    z: (K, N, m).
+    h: (K, N, m, n).
+    r: (K or 1, N or 1, m, m), symmetric positive definite.
+    weight: (K or 1, N), information weight of a sample, in 0..1 (below 1 for samples that share noise).
+    usable: (K, N), False where a model must not use a sample.
+    gate: (K or 1, N or 1), largest accepted normalised innovation squared, inf without gate.
     """
 
     z: Array
@@ -106,9 +109,10 @@ class Measurements:
 class Updated:
     """State after a block of measurements.
 
-    x: (K, n), p: (K, n, n) after the last sample. used: (K, N). nis: (K, N) normalised innovation squared νᵀS⁻¹ν of
-    usable samples against the state before them, else 0. at: x (E, K, n), P (E, K, n, n) after the requested numbers of
-    samples, if any.
+    x: (K, n), p: (K, n, n) after the last sample.
+    used: (K, N).
+    nis: (K, N) normalised innovation squared νᵀS⁻¹ν of usable samples against the state before them, else 0.
+    at: x (E, K, n), P (E, K, n, n) after the requested numbers of samples, if any.
     """
 
     x: Array
@@ -121,10 +125,10 @@ class Updated:
     def joined(models: Sequence[Updated]) -> Updated:
         """Return the joined updates of models, each with K = 1."""
         x, p, used, nis = (
-            np.concatenate(each) for each in zip(*((m.x, m.p, m.used, m.nis) for m in models), strict=True)
+            np.concatenate(parts) for parts in zip(*((m.x, m.p, m.used, m.nis) for m in models), strict=True)
         )
-        found = [each.at for each in models if each.at is not None]
-        at = GaussianState(*(np.concatenate(each, axis=1) for each in zip(*found, strict=True))) if found else None
+        found = [model.at for model in models if model.at is not None]
+        at = GaussianState(*(np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))) if found else None
         return Updated(x, p, used, nis, at)
 
 
@@ -133,9 +137,11 @@ def recursion(
 ) -> Updated:
     """Filter N samples in sequence.
 
-    x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q added before each sample, or None. ends: (E,) ascending
-    numbers of samples (0..N) after which the state is returned, too. Raises LinAlgError if S is not positive definite,
-    or a number is not finite.
+    x: (K, n).
+    p: (K, n, n).
+    process: (N, K, n, n) covariance Q added before each sample, or None.
+    ends: (E,) ascending numbers of samples (0..N) after which the state is returned, too. Raises LinAlgError if S is
+      not positive definite, or a number is not finite.
     """
     # per model: products of single matrices cost a third of those of stacks, and a live block has one sample
     models = [
@@ -143,12 +149,14 @@ def recursion(
         for k in range(len(x))
     ]
     paths, used, nis = zip(*models, strict=True)
-    at = None
+    at_ends = None
     if ends is not None:
-        wanted = [[path[end] for path in paths] for end in ends.tolist()]
-        at = GaussianState(*(np.array([[state[part] for state in each] for each in wanted]) for part in range(2)))
-    x, p = (np.array([path[-1][part] for path in paths]) for part in range(2))
-    return Updated(x, p, np.array(used), np.array(nis), at)
+        states = [[path[end] for path in paths] for end in ends.tolist()]
+        at_ends = GaussianState(
+            *(np.array([[state[k] for state in of_models] for of_models in states]) for k in range(2))
+        )
+    x, p = (np.array([path[-1][k] for path in paths]) for k in range(2))
+    return Updated(x, p, np.array(used), np.array(nis), at_ends)
 
 
 def _recursion_of_one(
@@ -161,8 +169,8 @@ def _recursion_of_one(
     n_samples, n = data.z.shape[1], len(x)
     identity = _identity(n)
     z, h_all = data.z[k], data.h[k]
-    r, gate, weight = (each[k] if len(each) > 1 else each[0] for each in (data.r, data.gate, data.weight))
-    r, gate = (each if len(each) == n_samples else [each[0]] * n_samples for each in (r, gate.tolist()))
+    r, gate, weight = (values[k] if len(values) > 1 else values[0] for values in (data.r, data.gate, data.weight))
+    r, gate = (values if len(values) == n_samples else [values[0]] * n_samples for values in (r, gate.tolist()))
     usable, weight = data.usable[k].tolist(), weight.tolist()
     used, nis = [], []
     path = [GaussianState(x, p)]
@@ -175,7 +183,7 @@ def _recursion_of_one(
         innovation = z[i] - h @ x
         nis_i = float(innovation @ _solve_definite(hpht + r_i, innovation))
         if not math.isfinite(nis_i):
-            raise np.linalg.LinAlgError("the numbers have run away")
+            raise np.linalg.LinAlgError("the filter diverged")
         is_used = usable[i] and nis_i <= gate[i]
         if is_used:
             if weight[i] != 1.0:  # the gate tests the sample at full weight; only the update uses the reduced one
@@ -348,7 +356,7 @@ def _solve(x: Array, p: Array, data: Measurements, measured: NDArray[np.intp]) -
 
 def _passes_before(x: Array, prior: Array, prior_state: Array, h: Array, z: Array, gate: Array) -> Mask:
     """Return which samples (K, N) pass the gate of the initial x (K, n), Λ (K, n, n), Λx (K, n)."""
-    innovation = [each - _dot(row, x.T[..., None]) for row, each in zip(h, z, strict=True)]
+    innovation = [measured - _dot(row, x.T[..., None]) for row, measured in zip(h, z, strict=True)]
     passes = _dot(innovation, innovation) <= gate
     # S >= R, so only samples that fail with R alone may fail
     k, at = np.nonzero(~passes)
@@ -403,7 +411,7 @@ def _cholesky(a: Elements) -> tuple[list[list[Array]], list[Array]]:
 
 
 def _invert_lower(low: Elements, inverse_diagonal: Sequence[Array]) -> list[list[Array]]:
-    """Return L⁻¹."""
+    """Return the inverse of lower triangular matrices L, row by row."""
     n = len(low)
     inverse: list[list[Array]] = []
     for i in range(n):
@@ -458,7 +466,7 @@ def _normalised_innovation_squared(
     s = [[_dot(u[i], u[j]) for j in range(i + 1)] for i in range(len(u))]
     for i, row in enumerate(s):
         row[i] += 1.0
-    innovation = [each - _dot(u[row], y) for row, each in enumerate(z)]
+    innovation = [measured - _dot(u[row], y) for row, measured in enumerate(z)]
     return distance_squared(s, innovation)
 
 

@@ -136,11 +136,14 @@ class Covariances:
 class SampleBlock:
     """Columns of one stream: N messages in order of arrival.
 
-    stamps_ns: (N,) of the header. values: (N, 3) velocity, m/s, in the DVL frame or the frame of `frames`; for the IMU
-    (N, 7), unit quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body frame, nan
-    where missing. covariances: of velocities. frames: (N,) of the reference, indices in `FRAMES`. refused: (N,) 0 for a
-    sample, else 1 + index in `reasons` of the reason (wrong frame, no bottom lock, undecodable ...); other columns of
-    such a row are undefined. arrival: (N,) strictly increasing, the order of arrival over all streams.
+    stamps_ns: (N,) of the header.
+    values: (N, 3) velocity, m/s, in the DVL frame or the frame of `frames`; for the IMU (N, 7), unit quaternion (x, y,
+      z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body frame, nan where missing.
+    covariances: of velocities.
+    frames: (N,) of the reference, indices in `FRAMES`.
+    refused: (N,) 0 for a sample, else 1 + index in `reasons` of the reason (wrong frame, no bottom lock, undecodable
+      ...); other columns of such a row are undefined.
+    arrival: (N,) strictly increasing, the order of arrival over all streams.
     """
 
     stream: Stream
@@ -153,6 +156,7 @@ class SampleBlock:
     reasons: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check the type of the stamps and the shape of each column."""
         n = len(self.stamps_ns)
         shapes = {
             "values": (self.values.shape, (n, WIDTH[self.stream])),
@@ -192,13 +196,13 @@ class SampleBlock:
 
     def joined(self, *others: SampleBlock) -> SampleBlock:
         """Return these rows followed by those of others of the stream; each call copies all rows."""
-        reasons = tuple(dict.fromkeys(reason for each in (self, *others) for reason in each.reasons))
+        reasons = tuple(dict.fromkeys(reason for block in (self, *others) for reason in block.reasons))
         refused = []
-        for each in (self, *others):
-            code = np.array([0, *(1 + reasons.index(reason) for reason in each.reasons)], dtype=np.uint8)
-            refused.append(code[each.refused])
+        for block in (self, *others):
+            code = np.array([0, *(1 + reasons.index(reason) for reason in block.reasons)], dtype=np.uint8)
+            refused.append(code[block.refused])
         stamps_ns, values, arrival, frames = (
-            np.concatenate([getattr(each, name) for each in (self, *others)])
+            np.concatenate([getattr(block, name) for block in (self, *others)])
             for name in ("stamps_ns", "values", "arrival", "frames")
         )
         covariances = self.covariances.joined(*(other.covariances for other in others))
@@ -242,8 +246,9 @@ def sample_block(
 ) -> SampleBlock:
     """Return a `SampleBlock`; values common to all rows may be given once.
 
-    covariance: (3, 3) or (N, 3, 3) (m/s)², None if not given. frames: one, or (N,) indices in `FRAMES`. arrival:
-    default is row order, valid for a single stream only.
+    covariance: (3, 3) or (N, 3, 3) (m/s)², None if not given.
+    frames: one, or (N,) indices in `FRAMES`.
+    arrival: default is row order, valid for a single stream only.
     """
     n = len(stamps_ns)
     if not isinstance(covariance, Covariances):
@@ -274,11 +279,11 @@ class Streams(NamedTuple):
 
     def halves(self) -> tuple[Streams, Streams]:
         """Return the first and second half of the rows by arrival."""
-        middle = np.sort(np.concatenate([each.arrival for each in self]))[sum(map(len, self)) // 2]
-        at = [int(np.searchsorted(each.arrival, middle)) for each in self]
+        middle = np.sort(np.concatenate([block.arrival for block in self]))[sum(map(len, self)) // 2]
+        at = [int(np.searchsorted(block.arrival, middle)) for block in self]
         return (
-            Streams(*(each.part(slice(end)) for each, end in zip(self, at, strict=True))),
-            Streams(*(each.part(slice(first, None)) for each, first in zip(self, at, strict=True))),
+            Streams(*(block.part(slice(end)) for block, end in zip(self, at, strict=True))),
+            Streams(*(block.part(slice(first, None)) for block, first in zip(self, at, strict=True))),
         )
 
     def arriving_by_stamp(self) -> Streams:
@@ -324,14 +329,20 @@ class Pairing:
 class AlignedBlock:
     """N DVL samples in order of stamps, with the other streams interpolated at their times.
 
-    stamps_ns: (N,) corrected for dvl_time_offset. row: (N,) number of the DVL message since the start, from 0.
-    velocity_dvl: (N, 3) m/s, DVL frame. covariance: (N, 3, 3) (m/s)² of it, nan where not given. interval_ns: (N,)
-    since the previous sample, 0 for the first. verdict: (N,) see `SampleUse`. prior_known: (N,) prior sway and heave
-    were known. attitude: (N, 7) quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body
-    frame; nan where unknown. pairing: (N,) see `Pairing`. reference: (N, 12) velocity (3), m/s, and covariance (9, nan
-    where not given), in the frame of frames: (N,) indices in `FRAMES`; nan where unpaired. unmeasured: (N,) a bit (1,
-    2, 4) per axis of that frame that the reference does not measure. weight: (N,) information weight of the reference,
-    below 1 where neighbours share its samples.
+    stamps_ns: (N,) corrected for dvl_time_offset.
+    row: (N,) number of the DVL message since the start, from 0.
+    velocity_dvl: (N, 3) m/s, DVL frame.
+    covariance: (N, 3, 3) (m/s)² of it, nan where not given.
+    interval_ns: (N,) since the previous sample, 0 for the first.
+    verdict: (N,) see `SampleUse`.
+    prior_known: (N,) prior sway and heave were known.
+    attitude: (N, 7) quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body frame; nan
+      where unknown.
+    pairing: (N,) see `Pairing`.
+    reference: (N, 12) velocity (3), m/s, and covariance (9, nan where not given), in the frame of frames: (N,) indices
+      in `FRAMES`; nan where unpaired.
+    unmeasured: (N,) a bit (1, 2, 4) per axis of that frame that the reference does not measure.
+    weight: (N,) information weight of the reference, below 1 where neighbours share its samples.
     """
 
     stamps_ns: Stamps
@@ -361,7 +372,7 @@ class AlignedBlock:
 
     def columns(self) -> tuple[NDArray[Any], ...]:
         """Return all columns, in the order of the fields."""
-        return tuple(getattr(self, each.name) for each in fields(self))
+        return tuple(getattr(self, column.name) for column in fields(self))
 
     @cached_property
     def usable(self) -> Mask:

@@ -39,7 +39,7 @@ class RowTable:
     IS_REUSED: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
-        own = {name: each for name, each in vars(cls).items() if isinstance(each, _Column)}
+        own = {name: value for name, value in vars(cls).items() if isinstance(value, _Column)}
         cls.LAYOUT = {**getattr(cls, "LAYOUT", {}), **own}
 
     def __init__(self) -> None:

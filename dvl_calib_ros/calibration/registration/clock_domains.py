@@ -61,9 +61,9 @@ def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, std_s:
     )
     # samples that are old when they are stamped have a configured delay, but no clock offset
     return [
-        each
-        for each in offsets
-        if min(abs(each.ahead), abs(ahead[each.stream] - ahead[base])) - std_s > limit_s(parameters)
+        offset
+        for offset in offsets
+        if min(abs(offset.ahead), abs(ahead[offset.stream] - ahead[base])) - std_s > limit_s(parameters)
     ]
 
 
@@ -126,11 +126,11 @@ class StreamClocks:
             if len(spread.kept):
                 ahead[stream] = float(median(1e-9 * spread.kept))
         reasons = []
-        for each in arrival_offset(ahead, parameters):
-            time_scale = TIME_SCALES.get(round(abs(each.ahead)))
+        for offset in arrival_offset(ahead, parameters):
+            time_scale = TIME_SCALES.get(round(abs(offset.ahead)))
             known = f" ({time_scale})" if time_scale else ""
-            values = {"seconds": abs(each.ahead), "side": each.side, "other": SPOKEN[each.other], "known": known}
-            reasons.append(finding("CLOCKS_APART", whose=SPOKEN[each.stream], **values))
+            values = {"seconds": abs(offset.ahead), "side": offset.side, "other": SPOKEN[offset.other], "known": known}
+            reasons.append(finding("CLOCKS_APART", whose=SPOKEN[offset.stream], **values))
         return reasons
 
 

@@ -163,11 +163,11 @@ def unsteady(
         return None
     # a delay without acceleration looks like a lever arm, which is the same in all stretches
     indices = [*range(N)[ARM], DELTA, RHO]
-    states = np.array([each.x[indices] for each in stretches])
+    states = np.array([stretch.x[indices] for stretch in stretches])
     lag_covariance = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
     # a stretch has few time blocks, so the autocorrelation of its residuals estimates lasting noise
-    noise_factors = [np.maximum(each.inflation / each.raised[indices], 1.0) for each in stretches]
-    covariances = np.array([each.p[np.ix_(indices, indices)] for each in stretches])
+    noise_factors = [np.maximum(stretch.inflation / stretch.raised[indices], 1.0) for stretch in stretches]
+    covariances = np.array([stretch.p[np.ix_(indices, indices)] for stretch in stretches])
     covariances *= np.array([np.outer(factor, factor) for factor in noise_factors])
     weights = np.linalg.inv(covariances + lag_covariance)
     names = DIRECTIONS if is_turned else {"dvl": DIRECTIONS["dvl"]}
@@ -175,7 +175,7 @@ def unsteady(
     no_change = np.zeros((len(times), len(indices)))
     chi2_unchanged = _fit_change(states, weights, no_change, everywhere).chi2
     chi2_without_one = [_fit_change(states, weights, no_change, n != left_out).chi2 for left_out in n]
-    found = []
+    hypotheses = []
     for pattern in (_ChangePattern(times, everywhere, None), *_step_patterns(times)):
         for name, direction in names.items():
             change = np.outer(pattern.delays, (0.0, 0.0, 0.0, *direction))
@@ -183,8 +183,8 @@ def unsteady(
             if not pattern.is_fixed.all():
                 fit = fit._replace(chi2=fit.chi2 + FREE_DELAY_CHI2)
             if pattern.is_possible(fit.value, streams.get(name) if is_turned else None, _reach(times)):
-                found.append(_ClockHypothesis(name, pattern, fit))
-    best = min(found, key=lambda each: each.fit.chi2)
+                hypotheses.append(_ClockHypothesis(name, pattern, fit))
+    best = min(hypotheses, key=lambda hypothesis: hypothesis.fit.chi2)
     chi2, value, at = best.fit.chi2, best.fit.value, best.pattern.at
     length = float(np.ptp(times)) if at is None else 1.0
     # noise as long as a stretch adds scatter, so all evidence is scaled down
@@ -195,7 +195,7 @@ def unsteady(
     is_one_bad_stretch = chi2 > min(chi2_without_one) + FREE_DELAY_CHI2 * scatter
     if not is_significant or is_one_bad_stretch or scatter > MAX_CHI2_LEFT:
         return None
-    chi2_other_clocks = min((each.fit.chi2 for each in found if each.clock != best.clock), default=np.inf)
+    chi2_other_clocks = min((other.fit.chi2 for other in hypotheses if other.clock != best.clock), default=np.inf)
     whose = best.clock if is_turned and chi2_other_clocks - chi2 > RULED_OUT * scatter else ""
     return ClockChange(whose, value, std=std) if at is None else ClockChange(whose, leap=value, at=at, std=std)
 

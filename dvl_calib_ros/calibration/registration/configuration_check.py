@@ -67,7 +67,7 @@ class Directions:
 
         NED needs several headings: a vehicle that yaws in waves on a straight course looks like NED.
         """
-        spread_body, spread_enu, spread_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
+        spread_body, spread_enu, spread_ned = (1.0 - self._length(mean) for mean in (self._body, self._enu, self._ned))
         max_spread = 1.0 - RESULTANT_LIMIT
         if spread_enu < max_spread and spread_enu < MAX_SPREAD_RATIO * spread_body:
             return True
@@ -113,7 +113,7 @@ _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
 def fitting_configuration(
-    motion: MotionStreams, declared: VelocityFrame, given: Registration | None, parameters: Parameters
+    motion: MotionStreams, declared: VelocityFrame, registration: Registration | None, parameters: Parameters
 ) -> Reason | None:
     """Return the finding of a configuration that fits much better than the configured one, else None.
 
@@ -121,7 +121,7 @@ def fitting_configuration(
     ----------
     motion: Streams as configured.
     declared: Configured reference frame.
-    given: Registration of the motion as configured; None if it failed.
+    registration: Of the motion as configured; None if it failed.
     parameters: With the configured axes, mounting and lever arm.
     """
     if not all(motion.measured):
@@ -134,14 +134,15 @@ def fitting_configuration(
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
     curves, misfit_as_given = Curves(motion), 1.0
-    if given is not None:
-        angle = _significant_angle(given.rotation_body_from_dvl, nominal, given.turn_std)
-        misfit_as_given = _misfit_with(given.residual, given.scale, angle)
+    if registration is not None:
+        angle = _significant_angle(registration.rotation_body_from_dvl, nominal, registration.turn_std)
+        misfit_as_given = _misfit_with(registration.residual, registration.scale, angle)
     if misfit_as_given < WRONG_FROM:
-        assert given is not None
+        assert registration is not None
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
         max_ratio = min(MAX_SIGN_RATIO, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
-        return wrong_axes(motion, curves, nominal, lever_arm, max_ratio * given.spread, parameters.dvl_axes, SIGNS)
+        level = max_ratio * registration.spread
+        return wrong_axes(motion, curves, nominal, lever_arm, level, parameters.dvl_axes, SIGNS)
     fits = {}
     for frame in _FRAMES:
         in_frame = _fit_in_frame(MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS), nominal)
@@ -168,16 +169,19 @@ class _FrameFit(NamedTuple):
 
 
 def _fit_in_frame(fit: MotionFit, nominal: Array) -> _FrameFit | None:
-    """Return the best fit of the configured mounting, of it with body or DVL axes rotated, and of a free one."""
+    """Return the best fit of the configured mounting, of it with body or DVL axes rotated, and of a free one.
+
+    nominal: (3, 3) rotation_body_from_dvl as configured.
+    """
     body_turned, dvl_turned = FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD
     give_up_above = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
     by_mounting = [nearest(fit, start, most=give_up_above) for start in (nominal, body_turned, dvl_turned, None)]
-    fitted = [each for each in by_mounting if each is not None]
+    fitted = [agreement for agreement in by_mounting if agreement is not None]
     if not fitted:
         return None
     turned = by_mounting[1]
     also_turned = turned is not None and misfit(turned, body_turned) < FITS_BELOW
-    return _FrameFit(min(fitted, key=lambda each: each.level), also_turned)
+    return _FrameFit(min(fitted, key=lambda fit: fit.level), also_turned)
 
 
 def nearest(
@@ -237,6 +241,8 @@ def wrong_axes(
 
     Each sign pattern has its own delay, because in waves a delay of half a period looks like a sign. The axis factors
     of the best pattern decide. most: largest residual, m/s per axis. patterns: signs, that of the axis ahead first.
+
+    nominal: (3, 3) rotation_body_from_dvl as configured. lever_arm: (3,) m.
     """
     ahead = int(np.argmax((motion.dvl.velocity**2).sum(axis=0)))
     others = [axis for axis in range(3) if axis != ahead]
@@ -258,7 +264,7 @@ def wrong_axes(
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[others].any():
-            mirrored, other = sorted(others, key=lambda each: not is_turned[each])
+            mirrored, other = sorted(others, key=lambda axis: not is_turned[axis])
             # the same data, read in the opposite axes, have the other axis inverted
             opposite = None if ahead else _OTHER_AXES.get(dvl_axes)
             alike = f" (read as {dvl_axes}; read as {opposite}, {'xyz'[other]} does)" if opposite else ""
@@ -308,7 +314,11 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
 def _configuration_finding(
     declared: VelocityFrame, best: VelocityFrame, rotation: Array, parameters: Parameters, also_turned: bool
 ) -> Reason | None:
-    """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
+    """Return the finding that names the best configuration. also_turned: rotated body axes fit as well.
+
+    declared, best: configured and best-fitting frame of the reference.
+    rotation: (3, 3) best-fitting rotation_body_from_dvl.
+    """
     nominal = parameters.rotation_dvl_from_body.T
     same_frame, same_mounting = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
     if same_frame and same_mounting:  # a large misalignment is left to the calibration

@@ -90,7 +90,10 @@ class _Misfits(NamedTuple):
 
 
 def _misfits(motion: MotionStreams, rotation: Array | None) -> _Misfits:
-    """Return the misfit at all pairs of delays up to `FARTHEST_S`; inf where too little overlaps."""
+    """Return the misfit at all pairs of delays up to `FARTHEST_S`; inf where too little overlaps.
+
+    rotation: (3, 3) rotation_body_from_dvl of the prior mounting, None to estimate it at each pair.
+    """
     step, grid = _grid(motion)
     max_shift = round(FARTHEST_S / step)
     delays = step * np.arange(-max_shift, max_shift + 1)
@@ -124,7 +127,9 @@ def _spectra(series: _Series, size: int) -> Array:
 class _LagSums(NamedTuple):
     """Sums over the overlap of body and DVL series at each lag (L,).
 
-    n_steps: number of steps. squares: Σ|B|² + Σ|v|². correlation: tr(C Σ v Bᵀ).
+    n_steps: number of steps.
+    squares: Σ|B|² + Σ|v|².
+    correlation: tr(C Σ v Bᵀ).
     """
 
     n_steps: Array
@@ -164,7 +169,10 @@ def _grid(motion: MotionStreams) -> tuple[float, Array]:
 
 
 def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
-    """Return a stream on the grid: means over about one step, linearly interpolated."""
+    """Return a stream on the grid: means over about one step, linearly interpolated.
+
+    times: (N,) s, of values (N, 3). grid: (L,) s, with an interval of `step` s.
+    """
     bins = np.floor((times - grid[0]) / step)
     starts = np.flatnonzero(np.diff(bins, prepend=bins[:1] - 1.0))
     count = np.diff(np.append(starts, len(times)))

@@ -71,7 +71,9 @@ READ_BY: Mapping[str, Array] = {
 class ImuFrame:
     """Hypothesis about the IMU's axes and world.
 
-    rotation_body_from_imu (3, 3); world: as parameter imu_frame; says: description. heading_offset: rad, as parameter.
+    rotation_body_from_imu (3, 3); world: as parameter imu_frame;
+    says: description.
+    heading_offset: rad, as parameter.
     """
 
     rotation_body_from_imu: Array
@@ -111,8 +113,10 @@ class Reading:
 class Agreement:
     """Agreement of DVL and reference under one reading.
 
-    residual: RMS as a share of the speed, with the given mounting or else the best one. rotation_dvl_from_body:
-    (3, 3) best rotation; best_residual: its residual. is_ahead: the vehicle mostly moves ahead or astern, not sideways.
+    residual: RMS as a share of the speed, with the given mounting or else the best one.
+    rotation_dvl_from_body: (3, 3) best rotation.
+    best_residual: its residual.
+    is_ahead: the vehicle mostly moves ahead or astern, not sideways.
     """
 
     reading: Reading
@@ -130,8 +134,9 @@ class Agreement:
 class Registered(NamedTuple):
     """Registration of a reading.
 
-    residual: as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, lever arm beyond the
-    configured one, and its σ.
+    residual: as a share of the speed.
+    rotation_dvl_from_body: (3, 3).
+    arm, arm_std: (3,) m, lever arm beyond the configured one, and its σ.
     """
 
     residual: float
@@ -151,6 +156,7 @@ class Readings:
     """
 
     def __init__(self, motion: MotionStreams, position: Array) -> None:
+        """Select the moving DVL samples that have reference and attitude, with the reference at their times."""
         self._motion, self._position = motion, position
         self._motions: dict[Reading, MotionStreams] = {}
         self._fits: dict[Reading, MotionFit] = {}
@@ -190,17 +196,17 @@ class Readings:
         if len(self) < FEWEST_VALUES:
             return []
         found = [self._agreement(reading, rotation_dvl_from_body) for reading in readings]
-        possible = [each for each in found if each is not None]
+        possible = [agreement for agreement in found if agreement is not None]
         # a small penalty prefers the smaller rotation; rounding makes ties stable (two inverted worlds fit equally)
         penalty = 0.02 if rotation_dvl_from_body is None else 0.0
-        return sorted(possible, key=lambda each: round(each.residual + penalty * each.angle, 9))
+        return sorted(possible, key=lambda agreement: round(agreement.residual + penalty * agreement.angle, 9))
 
-    def _agreement(self, reading: Reading, known: Array | None) -> Agreement | None:
-        """Compare velocities under a reading; None without its attitude. known: see `agreements`."""
+    def _agreement(self, reading: Reading, mounting: Array | None) -> Agreement | None:
+        """Compare velocities under a reading; None without its attitude. mounting: rotation_dvl_from_body, if known."""
         motion = self._read(reading)
         if motion is None:
             return None
-        prior = np.eye(3) if known is None else known
+        prior = np.eye(3) if mounting is None else mounting
         body = linear_at(motion.reference_times, motion.reference, self._at)
         if motion.in_earth:
             body = np.einsum("nji,nj->ni", attitude_at(motion.imu, self._at, GAP_S)[0], body)
@@ -214,8 +220,8 @@ class Readings:
         kept = errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))]
         best = best_rotation(dvl[kept], body[kept], prior)
         best_residual = _rms(dvl - body @ best.T) / speed
-        residual = best_residual if known is None else _rms(dvl - body @ known.T) / speed
-        travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
+        residual = best_residual if mounting is None else _rms(dvl - body @ mounting.T) / speed
+        travel = np.abs(body.mean(axis=0) if mounting is None else (dvl @ mounting).mean(axis=0))
         is_ahead = bool(travel[1] < max(travel[0], MIN_SIDEWAYS * speed))
         return Agreement(reading, residual, best, best_residual, is_ahead)
 
@@ -232,7 +238,7 @@ class Readings:
             return self._registered_with(reading, rotation_dvl_from_body)
         best = self._registered_with(reading, None)
         rolled = self._registered_with(reading, best.rotation_dvl_from_body @ FLU_FROM_FRD)
-        upright, other = sorted((best, rolled), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
+        upright, other = sorted((best, rolled), key=lambda fit: -float(fit.rotation_dvl_from_body[2, 2]))
         return other if other.residual < BETTER_BY * upright.residual else upright
 
     def _registered_with(self, reading: Reading, rotation_dvl_from_body: Array | None) -> Registered:
@@ -259,21 +265,21 @@ class Readings:
         wrong = wrong_axes(motion, Curves(motion), mounting, self._position, rotated.level, FROM_MESSAGE)
         return wrong is not None and wrong.code == "DVL_LEFT_HANDED"
 
-    def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
+    def without_roll(self, agreement: Agreement, rotation_dvl_from_body: Array) -> Array:
         """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""
-        travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
+        travel = (self._dvl @ FLU_FROM_FRD if agreement.reading.turned else self._dvl).mean(axis=0)
         unrolled = least_turn(rotation_dvl_from_body.T @ travel, travel)
-        is_needed = ROLL_RATIO * self.agreements([found.reading], unrolled)[0].residual > found.best_residual
+        is_needed = ROLL_RATIO * self.agreements([agreement.reading], unrolled)[0].residual > agreement.best_residual
         return rotation_dvl_from_body if is_needed else unrolled
 
-    def is_in_body(self, found: Agreement) -> bool:
+    def is_in_body(self, agreement: Agreement) -> bool:
         """Return whether DVL and reference are in the body: they also agree if both are in the earth frame."""
-        motion = self._read(replace(found.reading, reference=VelocityFrame.ENU.value))
+        motion = self._read(replace(agreement.reading, reference=VelocityFrame.ENU.value))
         if motion is None:
             return True
         directions = Directions()
-        dvl = self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl
-        directions.add(dvl @ found.rotation_dvl_from_body, attitude_at(motion.imu, self._at, GAP_S)[0])
+        dvl = self._dvl @ FLU_FROM_FRD if agreement.reading.turned else self._dvl
+        directions.add(dvl @ agreement.rotation_dvl_from_body, attitude_at(motion.imu, self._at, GAP_S)[0])
         return directions.stay_in_the_body
 
     def _fit(self, reading: Reading) -> MotionFit | None:

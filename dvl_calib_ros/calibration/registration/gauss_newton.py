@@ -5,6 +5,8 @@ With s the stamp of a reference sample, ρ and τ the delays of reference and DV
     B(s - ρ) + ω(s - ρ) × l - (1 + k) C v(s + δ),   B(s - ρ) = R(s - ρ)ᵀ g(s).
 
 It is linearised about the last round: δ by the slope of v, ρ by ω × B, because another attitude rotates the reference.
+
+Shapes: J compared references, A measured axes, 9 states.
 """
 
 from __future__ import annotations
@@ -60,8 +62,9 @@ BLOCKS, CLOCK_LASTING_Z = 48, 2.5
 class Claimed(NamedTuple):
     """Covariance of the states with σ from the scatter of time blocks.
 
-    p: (9, 9). raised: (9,) factor of each σ over white noise. inflation: factor of the clocks' σ over white noise, by
-    time blocks and by the autocorrelation of the residuals.
+    p: (9, 9).
+    raised: (9,) factor of each σ over white noise.
+    inflation: factor of the clocks' σ over white noise, by time blocks and by the autocorrelation of the residuals.
     """
 
     p: Array
@@ -72,9 +75,12 @@ class Claimed(NamedTuple):
 class Fitted(NamedTuple):
     """State of a fit.
 
-    x (9,); rotation_body_from_dvl (3, 3). squares: (J,) squared residual of each reference, (m/s)². level: robust
-    residual per axis, m/s, of `rows` references. speed: RMS of the compared references, m/s. at: (J,) indices of these
-    references. claims: covariance, computed on demand because it takes as long as three rounds.
+    x (9,); rotation_body_from_dvl (3, 3).
+    squares: (J,) squared residual of each reference, (m/s)².
+    level: robust residual per axis, m/s, of `rows` references.
+    speed: RMS of the compared references, m/s.
+    at: (J,) indices of these references.
+    claims: covariance, computed on demand because it takes as long as three rounds.
     """
 
     x: Array
@@ -146,8 +152,11 @@ class AxisFactors(NamedTuple):
 class _AtDelays(NamedTuple):
     """Streams at the times of the J compared references, for delays ρ and δ.
 
-    at: (J,) their indices. body: (J, 3) m/s, B. rates: (J, 3) rad/s, ω. velocity: (J, 3) m/s, v, DVL frame, with its
-    slope (J, 3) m/s² and the slope's noise gain (J,). rotation_enu_from_body: (J, 3, 3), zero if not needed.
+    at: (J,) their indices.
+    body: (J, 3) m/s, B.
+    rates: (J, 3) rad/s, ω.
+    velocity: (J, 3) m/s, v, DVL frame, with its slope (J, 3) m/s² and the slope's noise gain (J,).
+    rotation_enu_from_body: (J, 3, 3), zero if not needed.
     """
 
     at: Index
@@ -162,8 +171,11 @@ class _AtDelays(NamedTuple):
 class _Rows(NamedTuple):
     """Residuals linearised about a state, along the A measured axes.
 
-    residual: (J, A) m/s. jacobian: (J, A, 9) by the states. at: (J,) indices of the references. delay_noise: (J,)
-    (m/s²)², expected squares of the δ column by DVL noise alone. speed: RMS, m/s.
+    residual: (J, A) m/s.
+    jacobian: (J, A, 9) by the states.
+    at: (J,) indices of the references.
+    delay_noise: (J,) (m/s²)², expected squares of the δ column by DVL noise alone.
+    speed: RMS, m/s.
     """
 
     residual: Array
@@ -188,7 +200,9 @@ class _Step(NamedTuple):
 class MotionFit:
     """Least squares of one motion.
 
-    is_turned: an attitude rotates the reference. times: (J,) s of the used references; speed: their RMS, m/s.
+    is_turned: an attitude rotates the reference.
+    times: (J,) s of the used references.
+    speed: their RMS, m/s.
     dvl_noise: variance of the DVL's white noise, (m/s)².
     """
 

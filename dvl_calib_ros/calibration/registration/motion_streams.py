@@ -1,4 +1,7 @@
-"""Motion: DVL, reference and IMU streams as smoothed columns, in s since a common epoch."""
+"""Motion: DVL, reference and IMU streams as smoothed columns, in s since a common epoch.
+
+Shapes: J points of time, N samples.
+"""
 
 from __future__ import annotations
 
@@ -39,9 +42,12 @@ from ..streams.stream_order import strays
 class MotionStreams:
     """Streams of one vehicle with increasing stamps.
 
-    dvl: velocity in the DVL frame. reference_times (M,) s, reference (M, 3) m/s: ENU if in_earth, else body frame.
-    measured: (3,) measured axes of the reference. imu: attitudes, may be missing. turns: angular rates. epoch_ns: stamp
-    of time 0, before corrections.
+    dvl: velocity in the DVL frame.
+    reference_times (M,) s, reference (M, 3) m/s: ENU if in_earth, else body frame.
+    measured: (3,) measured axes of the reference.
+    imu: attitudes, may be missing.
+    turns: angular rates.
+    epoch_ns: stamp of time 0, before corrections.
     """
 
     dvl: DvlColumns
@@ -154,27 +160,31 @@ class Curves:
     """Smoothed DVL velocity, its slope and turn rates on a fine grid, computed once for all delays."""
 
     def __init__(self, motion: MotionStreams) -> None:
-        """Smooth the streams of a motion."""
+        """Smooth the DVL's velocity and the turn rates of a motion on grids with steps of BIN_S or more."""
         times = motion.dvl.times
-        length = float(times[-1] - times[0])
-        self._step, self._start = max(BIN_S, length / MOST_GRID), float(times[0])
-        self._grid = self._start + self._step * np.arange(int(length / self._step) + 2)
-        typical = float(median(np.diff(times)))
-        reach = reach_at(spacing_at(times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)
-        reach = np.clip(reach, LEAST_SLOPE_REACH_S, None)
-        reach[np.isnan(reach)] = max(LEAST_SLOPE_REACH_S, min(REACH_INTERVALS * typical, MOST_REACH_S))
-        fits = [local_fit(times, motion.dvl.velocity, self._grid[at], reach[at]) for at in _parts(len(self._grid))]
-        self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
-        self._found = np.concatenate([fit.found for fit in fits])
+        length_s = float(times[-1] - times[0])
+        self._step, self._start = max(BIN_S, length_s / MOST_GRID), float(times[0])
+        self._grid = self._start + self._step * np.arange(int(length_s / self._step) + 2)
+        self._smooth_velocity(motion.dvl)
         self._turns, self._turns_start = np.zeros((2, 3)), 0.0
         # near the DVL data only: the grid must not span an arbitrary IMU clock offset
-        own = motion.turns.times
-        own = own[(own >= times[0] - TURNS_BEYOND_S) & (own <= times[-1] + TURNS_BEYOND_S)]
-        if len(own) > 1:
-            grid = np.arange(own[0], own[-1] + self._step, self._step)
+        imu_times = motion.turns.times
+        imu_times = imu_times[(imu_times >= times[0] - TURNS_BEYOND_S) & (imu_times <= times[-1] + TURNS_BEYOND_S)]
+        if len(imu_times) > 1:
+            grid = np.arange(imu_times[0], imu_times[-1] + self._step, self._step)
             self._turns_start = float(grid[0])
             rates = [angular_velocity_at(motion.turns, grid[at], GAP_S) for at in _parts(len(grid))]
             self._turns = np.nan_to_num(np.concatenate(rates))
+
+    def _smooth_velocity(self, dvl: DvlColumns) -> None:
+        """Fit velocity (m/s), slope (m/s²) and the slope's noise gain at the grid, over a reach (s) by the spacing."""
+        reach = reach_at(spacing_at(dvl.times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)
+        reach = np.clip(reach, LEAST_SLOPE_REACH_S, None)
+        usual = REACH_INTERVALS * float(median(np.diff(dvl.times)))
+        reach[np.isnan(reach)] = max(LEAST_SLOPE_REACH_S, min(usual, MOST_REACH_S))
+        fits = [local_fit(dvl.times, dvl.velocity, self._grid[at], reach[at]) for at in _parts(len(self._grid))]
+        self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
+        self._found = np.concatenate([fit.found for fit in fits])
 
     def signed(self, signs: Array) -> Curves:
         """Return the curves of a DVL with these axis signs (3,)."""

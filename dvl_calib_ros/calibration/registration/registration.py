@@ -2,6 +2,9 @@
 
 Correlation over all delays within a minute selects candidates (`delay_search`), least squares refines them
 (`gauss_newton`). The IMU's clock is the time base, because its attitude rotates the reference into the body.
+
+Arguments in this module: `rotation` (3, 3) is the rotation_body_from_dvl of the prior mounting, None to estimate it;
+`lever_arm` (3,) m is the configured one; ρ and δ (rho, delta) are delays in s.
 """
 
 from __future__ import annotations
@@ -86,16 +89,24 @@ class Clock:
 class Registration:
     """Delays, mounting, lever arm and scale of one motion.
 
-    dvl, reference: clocks relative to the IMU. imu: its own clock, if it alone is off. apart: delay of the DVL relative
-    to the reference. is_turned: an attitude rotates the reference; without it the delayed clock is not identifiable,
-    and the reference is assumed synchronised. are_known: the data determine the delays.
+    dvl, reference: clocks relative to the IMU.
+    imu: its own clock, if it alone is off.
+    apart: delay of the DVL relative to the reference.
+    is_turned: an attitude rotates the reference; without it the delayed clock is not identifiable, and the reference is
+      assumed synchronised.
+    are_known: the data determine the delays.
 
-    rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: DVL from the reference point,
-    body frame. scale, scale_std: DVL scale error, dimensionless. residual: as a share of the speed; spread:
-    residual per axis, m/s; speed: RMS, m/s. unsteady: clock drift or step; all other fields hold after its correction.
+    rotation_body_from_dvl (3, 3), turn_std (3,) rad.
+    lever_arm, lever_arm_std (3,) m: DVL from the reference point, body frame.
+    scale, scale_std: DVL scale error, dimensionless.
+    residual: as a share of the speed.
+    spread: residual per axis, m/s.
+    speed: RMS, m/s.
+    unsteady: clock drift or step; all other fields hold after its correction.
 
-    open_std_s: σ (s) of the reference delay from the data alone. open_by: (7,) derivatives of the DVL's rotation (rad,
-    body), lever arm (m) and DVL delay (s) with respect to it. next_worse: chi-square margin to the next explanation.
+    open_std_s: σ (s) of the reference delay from the data alone.
+    open_by: (7,) derivatives of the DVL's rotation (rad, body), lever arm (m) and DVL delay (s) with respect to it.
+    next_worse: chi-square margin to the next explanation.
     """
 
     dvl: Clock
@@ -271,14 +282,14 @@ def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: 
     """
     candidates = candidate_delays(motion, rotation)
     max_misfit = MISFIT_LIMIT[0] * candidates[0].misfit + MISFIT_LIMIT[1] if candidates else 0.0
-    delays = [(each.reference, each.dvl - each.reference) for each in candidates if each.misfit <= max_misfit]
+    delays = [(pair.reference, pair.dvl - pair.reference) for pair in candidates if pair.misfit <= max_misfit]
     fits = [quick(rho, delta, rotation) for rho, delta in {*delays, (0.0, 0.0)}]
-    possible = [each for each in fits if each is not None and _is_possible(each)]
+    possible = [fit for fit in fits if fit is not None and _is_possible(fit)]
     if not possible:
         return None
-    closest = min(possible, key=lambda each: each.level)
-    as_good = [each for each in possible if _is_as_good(motion, quick, each, closest, rotation)]
-    return min(as_good, key=lambda each: abs(each.x[RHO]) + abs(each.dvl_delay_s))
+    closest = min(possible, key=lambda fit: fit.level)
+    as_good = [candidate for candidate in possible if _is_as_good(motion, quick, candidate, closest, rotation)]
+    return min(as_good, key=lambda fit: abs(fit.x[RHO]) + abs(fit.dvl_delay_s))
 
 
 def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
@@ -386,7 +397,9 @@ def _fit_in_sync(
 ) -> _HeldFit:
     """Fit with some or all clocks synchronised, and compare with the fit `free`.
 
-    rho, delta: initial delays, s. held_clocks: rows that select the synchronised clocks. penalty: chi-square added.
+    rho, delta: initial delays, s.
+    held_clocks: rows that select the synchronised clocks.
+    penalty: chi-square added.
     """
     held = fit(rho, delta, rotation, held_clocks)
     if held is None or not _is_possible(held):

@@ -120,7 +120,8 @@ def extrinsics_of(
     """Return the extrinsics of a model state (n,), estimated with these parameters.
 
     state: with the σ of its recording. A component is observable if its σ without bias is at most half of its prior σ.
-    span_ns: stamps of the first and last sample. by_bias: (n, 3), `BiasCovariance.columns` of the state.
+    span_ns: stamps of the first and last sample.
+    by_bias: (n, 3), `BiasCovariance.columns` of the state.
     """
     others = scale_and_delay(model, state, parameters)
     value = np.array(
@@ -147,7 +148,7 @@ def rejection(findings: Iterable[Mapping[str, Any]]) -> str:
 
     A large misalignment alone does not invalidate the numbers: a mounting may have moved.
     """
-    sentences = (each["says"] for each in findings if each["severity"] == "reject" and each["code"] != _OF_SIZE)
+    sentences = (reason["says"] for reason in findings if reason["severity"] == "reject" and reason["code"] != _OF_SIZE)
     return str(next(sentences, ""))
 
 

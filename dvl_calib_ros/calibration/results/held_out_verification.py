@@ -160,7 +160,10 @@ def _error_finding(
     typical_error: float | None,
     own_error: float,
 ) -> Reason:
-    """Return the finding on the held-out error: outliers, worse, too large, implausible, noisier or as predicted."""
+    """Return the finding on the held-out error: outliers, worse, too large, implausible, noisier or as predicted.
+
+    typical_error, own_error: velocity errors without outliers, and by σ of time blocks, see `verify`.
+    """
     if held_out is None:
         return finding("HELD_OUT_TOO_FEW")
     uncorrected, corrected, predicted = held_out.uncorrected, held_out.corrected, held_out.predicted
@@ -208,8 +211,8 @@ def verification_document(verification: Verification) -> dict[str, Any]:
     held_out = verification.held_out
     return {
         "verdict": verification.verdict.value,
-        "reasons": [each.sentence for each in verification.reasons],
-        "findings": [each.as_dict() for each in verification.reasons],
+        "reasons": [reason.sentence for reason in verification.reasons],
+        "findings": [reason.as_dict() for reason in verification.reasons],
         "mounting": verification.mounting.sentence if verification.mounting is not None else "",
         "held_out": None
         if held_out is None

@@ -63,11 +63,9 @@ def quantities(result: Result) -> list[Quantity]:
             Quantity(name, parameters.lever_arm[i], float(arm[i]), float(arm_std[i]), " m", name not in not_observable)
             for i, name in enumerate(("lever arm x", "lever arm y", "lever arm z"))
         ]
-    for delay in result.delays:
-        of_day = "" if delay.day is None else f", {delay.day.name or date(delay.day.first_ns)}"
-        found.append(
-            Quantity(f"{LATE}{of_day}", parameters.dvl_time_offset, delay.seconds, delay.std, " s", delay.shown)
-        )
+    for delay in result.delays:  # one per recording, or one for all
+        name = LATE if delay.day is None else f"{LATE}, {delay.day.name or date(delay.day.first_ns)}"
+        found.append(Quantity(name, parameters.dvl_time_offset, delay.seconds, delay.std, " s", delay.shown))
     return found
 
 
@@ -78,7 +76,7 @@ def not_shown(result: Result) -> dict[str, str]:
     mounted across, roll of the vehicle is pitch of the DVL. The scale across is omitted, because few vehicles can
     observe it.
     """
-    shown = {each.name for each in quantities(result) if each.shown}
+    shown = {quantity.name for quantity in quantities(result) if quantity.shown}
     causes: dict[str, dict[str, None]] = {}
     for entry in result.estimate.observability:
         if entry.axis in _NEED_IMU and not _has_imu(result):

@@ -92,14 +92,18 @@ class BiasCovariance(NamedTuple):
 class Estimate:
     """State of one model.
 
-    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors, then nuisance states. covariance: (n,
-    n), for the next recording. recording_covariance: (n, n), for this one, inflated by the scatter of time blocks.
-    filter_covariance: (n, n), of the filter alone. left_open: (n, n), contribution of the reference clock to covariance
-    and recording_covariance; at one speed a delay looks like a lever arm. of_bias: effect of the DVL bias on the state
-    and these covariances, for the mounting, not for velocities at the speeds driven. used, gated: samples. mean_nis:
-    mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter. heading_deviation: x
-    (4,), P (4, 4): coefficients of sine and cosine of the yaw and of twice the yaw, rad; None for models with exact
-    heading.
+    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors, then nuisance states.
+    covariance: (n, n), for the next recording.
+    recording_covariance: (n, n), for this one, inflated by the scatter of time blocks.
+    filter_covariance: (n, n), of the filter alone.
+    left_open: (n, n), contribution of the reference clock to covariance and recording_covariance; at one speed a delay
+      looks like a lever arm.
+    of_bias: effect of the DVL bias on the state and these covariances, for the mounting, not for velocities at the
+      speeds driven.
+    used, gated: samples.
+    mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter.
+    heading_deviation: x (4,), P (4, 4): coefficients of sine and cosine of the yaw and of twice the yaw, rad; None for
+      models with exact heading.
     """
 
     model: str
@@ -231,11 +235,16 @@ class Delay(NamedTuple):
 class Result:
     """Estimates of all models, the selected one, and counts of the data.
 
-    first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
-    `Calibrator.counts`. segments: selected model over time. parameters: as used, plain values. verifications: by model,
-    empty without verification. suggestion: configuration that fits, if the configured one is grossly wrong. days:
-    recordings in order, empty for a single one; days_of: the model of their states. doubts: live warnings with the
-    severity of a replay's verdict. iac_model: final model by the selection of the paper.
+    first_ns, last_ns: stamps of the DVL samples received in order, None before the first.
+    counts: see `Calibrator.counts`.
+    segments: selected model over time.
+    parameters: as used, plain values.
+    verifications: by model, empty without verification.
+    suggestion: configuration that fits, if the configured one is grossly wrong.
+    days: recordings in order, empty for a single one.
+    days_of: the model of their states.
+    doubts: live warnings with the severity of a replay's verdict.
+    iac_model: final model by the selection of the paper.
     """
 
     selected: str
@@ -279,7 +288,7 @@ class Result:
         std = estimate.std_of("time_offset")
         if std is None:
             return ()
-        shown = all(each.observed for each in estimate.observability if each.axis == "time offset")
+        shown = all(entry.observed for entry in estimate.observability if entry.axis == "time offset")
         return (Delay(None, estimate.dvl_time_offset(self.parameters["dvl_time_offset"]), float(std[0]), shown),)
 
 
@@ -316,9 +325,10 @@ _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 class MountingPose(NamedTuple):
     """Pose of the DVL frame in the body.
 
-    position: (3,) m in the body, nan if unknown. rotation_body_from_dvl: (3, 3), of the frame of the driver data.
+    position: (3,) m in the body, nan if unknown.
+    rotation_body_from_dvl: (3, 3), of the frame of the driver data.
     covariance: (6, 6) of position (m²) and of small rotations about body axes (rad²), as in
-    geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of components that the model does not estimate.
+      geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of components that the model does not estimate.
     """
 
     position: tuple[float, float, float]
@@ -337,7 +347,7 @@ def position_in_body(model: Model, state: GaussianState, parameters: Parameters)
     given = np.array(parameters.lever_arm)
     arm = given
     if parameters.dvl_position == FROM_REFERENCE:
-        seen = {each.name for each in observability(model, state.p, parameters) if each.observed}
+        seen = {entry.name for entry in observability(model, state.p, parameters) if entry.observed}
         shown: Mask = np.array([name in seen for name in _ARM])
         if not given.any() and not shown.all():
             return None
@@ -395,7 +405,7 @@ def corrected_rpy(misalignment: Array, parameters: Parameters) -> Array:
 def rpy_jacobian(misalignment: Array, parameters: Parameters) -> Array:
     """Return the derivative (3, 3) of roll, pitch, yaw of the corrected mounting with respect to φ (3,)."""
     up, down = (
-        np.array([corrected_rpy(misalignment + sign * each, parameters) for each in _SMALL_TURN * np.eye(3)])
+        np.array([corrected_rpy(misalignment + sign * turn, parameters) for turn in _SMALL_TURN * np.eye(3)])
         for sign in (1.0, -1.0)
     )
     return near_angles(up - down, 0.0).T / (2.0 * _SMALL_TURN)

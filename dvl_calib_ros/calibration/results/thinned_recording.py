@@ -42,15 +42,15 @@ class ThinnedBlock(NamedTuple):
     ) -> ThinnedBlock:
         """Return the thinned columns of a block. noise_dvl: (3, 3) (m/s)²."""
         first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
-        kept = first + _thinned_seconds(dvl.times[first:last])
-        thinned_dvl = DvlColumns(dvl.times[kept], dvl.velocity[kept].copy())
+        dvl_rows = first + _thinned_seconds(dvl.times[first:last])
+        thinned_dvl = DvlColumns(dvl.times[dvl_rows], dvl.velocity[dvl_rows].copy())
         first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
-        kept = first + _thinned_seconds(imu.times[first:last])
+        imu_rows = first + _thinned_seconds(imu.times[first:last])
         # rates are averaged: the noise of one sample exceeds the change until the next kept one
         reach = 0.5 * KEPT_EVERY_S
         first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
-        rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[kept], reach)
-        thinned_imu = ImuColumns(imu.times[kept], imu.orientation[kept], rates)
+        rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[imu_rows], reach)
+        thinned_imu = ImuColumns(imu.times[imu_rows], imu.orientation[imu_rows], rates)
         # copies, because views would keep the whole arrays in memory
         return ThinnedBlock(thinned_dvl, noise_dvl, reference._replace(velocity=reference.velocity.copy()), thinned_imu)
 
@@ -89,9 +89,11 @@ NO_TERMS = Terms(np.zeros(6), np.zeros(3), 0.0)
 class Compared(NamedTuple):
     """Comparison of N DVL samples with the reference.
 
-    error (N, 3): reference minus corrected DVL, body, m/s; nan without reference, 0 along unmeasured axes. measured (N,
-    3, 3): projection on the measured axes, body. body (N, 3): reference velocity. rotation_enu_from_body (N, 3, 3),
-    oriented (N,): its validity. rates (N, 3): rad/s.
+    error (N, 3): reference minus corrected DVL, body, m/s; nan without reference, 0 along unmeasured axes.
+    measured (N, 3, 3): projection on the measured axes, body.
+    body (N, 3): reference velocity.
+    rotation_enu_from_body (N, 3, 3), oriented (N,): its validity.
+    rates (N, 3): rad/s.
     """
 
     error: Array
@@ -111,12 +113,12 @@ class ThinnedRecording(NamedTuple):
     imu: ImuColumns
 
     @staticmethod
-    def of(kept: Sequence[ThinnedBlock]) -> ThinnedRecording:
+    def of(blocks: Sequence[ThinnedBlock]) -> ThinnedRecording:
         """Return the joined blocks."""
-        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
-        noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
-        reference = zip(*(each.reference for each in kept), strict=True)
-        imu = zip(*(each.imu for each in kept), strict=True)
+        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(block.dvl for block in blocks), strict=True)))
+        noise = np.concatenate([np.full(len(block.dvl.times), np.trace(block.noise_dvl)) for block in blocks])
+        reference = zip(*(block.reference for block in blocks), strict=True)
+        imu = zip(*(block.imu for block in blocks), strict=True)
         return ThinnedRecording(
             dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
         )

@@ -72,8 +72,9 @@ NO_DECISIONS = Decisions(*(np.zeros(0, dtype=kind) for kind in (np.intp, np.intp
 class Events(NamedTuple):
     """The T admitted samples in order of arrival.
 
-    dvl_at, reference_at, imu_at: event index of each sample of a stream. reference_ns, imu_ns: newest stamps after each
-    event (`LONG_AGO_NS`: none). horizon_ns: horizon after each event, see `Aligner.horizon_ns`.
+    dvl_at, reference_at, imu_at: event index of each sample of a stream.
+    reference_ns, imu_ns: newest stamps after each event (`LONG_AGO_NS`: none).
+    horizon_ns: horizon after each event, see `Aligner.horizon_ns`.
     """
 
     arrival: Stamps
@@ -96,7 +97,7 @@ class Events(NamedTuple):
         order = np.argsort(arrival, kind="stable")
         event_of_sample = np.empty(len(order), dtype=np.intp)
         event_of_sample[order] = np.arange(len(order))
-        dvl_at, reference_at, imu_at = np.split(event_of_sample, np.cumsum([len(each) for each in arrivals[:2]]))
+        dvl_at, reference_at, imu_at = np.split(event_of_sample, np.cumsum([len(arrival) for arrival in arrivals[:2]]))
         newest_ns = []
         for events, stamps, newest_before in zip((dvl_at, reference_at, imu_at), stamps_ns, before_ns, strict=True):
             column = np.full(len(order), LONG_AGO_NS if newest_before is None else newest_before, dtype=np.int64)
@@ -114,7 +115,7 @@ def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
     """Check all rows for validity, and screen their values."""
     dvl, reference, imu = streams
     max_speed, believed = parameters.max_speed, parameters.use_message_covariance
-    dvl_screen, reference_screen = (screen_columns(each.covariances, believed) for each in (dvl, reference))
+    dvl_screen, reference_screen = (screen_columns(block.covariances, believed) for block in (dvl, reference))
     orientation, rates = unit_quaternions(imu.orientation), valid_rates(imu.angular_velocity)
     dvl_is_measured = dvl_screen.unmeasured == 0
     reference_is_measured = reference_screen.unmeasured != ALL_AXES
@@ -265,7 +266,9 @@ class Aligner(LiveAlignment):
         self._n_messages += len(dvl)
         return True
 
-    def _count_columns(self, valid: ScreenedStreams, chunk: OrderedStreams, found: Decisions, events: Events) -> None:
+    def _count_columns(
+        self, valid: ScreenedStreams, chunk: OrderedStreams, decisions: Decisions, events: Events
+    ) -> None:
         """Count messages that are invalid, refused or not in order."""
         for block, is_valid, order in zip(
             valid.streams, valid[1:4], (chunk.dvl, chunk.reference, chunk.imu), strict=True
@@ -284,8 +287,8 @@ class Aligner(LiveAlignment):
         stamps_ns = reference.stamps_ns[valid.reference] - self._clocks.reference_ns
         if len(stamps_ns):
             at = np.searchsorted(events.arrival, reference.arrival[valid.reference])
-            decided = np.concatenate([[self.partners.decided_ns], found.stamps_ns])
-            before = decided[np.searchsorted(found.paired_at, at)]
+            decided = np.concatenate([[self.partners.decided_ns], decisions.stamps_ns])
+            before = decided[np.searchsorted(decisions.paired_at, at)]
             add_count(self.tally["reference"], "late", int(np.count_nonzero(stamps_ns < before)))
 
     def _append_columns(self, valid: ScreenedStreams, chunk: OrderedStreams, events: Events) -> None:
@@ -332,7 +335,9 @@ def counted(
     not_oriented (no attitude or no angular velocity) + awaiting_attitude. A model's used + gated (+ samples in its
     prior window) are its input: usable samples; with GNSS the paired ones, with attitude the oriented ones.
 
-    gnss_losses: number of reference outages. restarts: of the calibration; restarted: of single models.
+    gnss_losses: number of reference outages.
+    restarts: of the calibration.
+    restarted: of single models.
     """
     counts = {name: dict(tally) for name, tally in aligner.tally.items()}
     for stream, order in aligner.orders.items():
@@ -362,7 +367,7 @@ def counted(
 
 
 def counts_by_use(
-    counts: Mapping[str, Mapping[str, int]], needs: Needs, given: int, used: int, gated: int
+    counts: Mapping[str, Mapping[str, int]], needs: Needs, passed: int, used: int, gated: int
 ) -> dict[str, int]:
     """Return the number of received DVL samples in each state, for one model; the sum is ``received``.
 
@@ -376,7 +381,7 @@ def counts_by_use(
         Result of `counted`.
     needs
         Input that the model requires of a sample.
-    given
+    passed
         Number of samples passed to the model.
     used, gated
         Number of samples that the model used and gated.
@@ -384,7 +389,7 @@ def counts_by_use(
     dvl, pairing = counts["dvl"], counts["pairing"]
     unusable, unpaired, waiting = dvl["accepted"] - dvl["usable"] - dvl["awaiting_imu"], 0, 0
     if needs is Needs.REFERENCE:  # unusable rows are paired, too
-        unusable, unpaired, waiting = pairing["paired"] - given, pairing["unpaired"], pairing["awaiting_reference"]
+        unusable, unpaired, waiting = pairing["paired"] - passed, pairing["unpaired"], pairing["awaiting_reference"]
     elif needs is Needs.ATTITUDE:
         unpaired, waiting = pairing["not_oriented"], pairing["awaiting_attitude"]
     elif needs is Needs.ATTITUDE_IF_KNOWN:
@@ -394,7 +399,7 @@ def counts_by_use(
         "unusable": unusable,
         "unpaired": unpaired,
         "waiting": dvl["held"] + dvl["awaiting_imu"] + waiting,
-        "gathered": given - used - gated,
+        "gathered": passed - used - gated,
         "used": used,
         "gated": gated,
     }

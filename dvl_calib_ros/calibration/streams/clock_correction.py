@@ -20,8 +20,9 @@ S = TypeVar("S", int, Stamps)
 class Clocks:
     """Configured delays of the stamps.
 
-    dvl_ns, reference_ns, imu_ns: constant offsets, ns. drift: of the DVL clock, s/s since its first stamp. jump_ns:
-    additional delay of DVL stamps from stamp jump_at_ns on.
+    dvl_ns, reference_ns, imu_ns: constant offsets, ns.
+    drift: of the DVL clock, s/s since its first stamp.
+    jump_ns: additional delay of DVL stamps from stamp jump_at_ns on.
     """
 
     dvl_ns: int = 0

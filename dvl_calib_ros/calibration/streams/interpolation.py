@@ -3,6 +3,8 @@
 Delayed streams are compared at times between their samples. Linear interpolation would bias the delay: its noise is
 halved midway between samples, and it ignores curvature. Local regression (Cleveland, "Robust locally weighted
 regression", 1979), a weighted quadratic through five or six samples, filters alike everywhere and has a slope.
+
+Shapes: N samples, interpolated at J points of time.
 """
 
 from __future__ import annotations
@@ -208,7 +210,9 @@ def reach_at(spacing: Array, least: float, most: float) -> Array:
 def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     """Fit a quadratic to the samples within `reach` of each time, weighted by (1 - |u|³)³ with u = distance / reach.
 
-    times: (N,) s, increasing. values: (N, c). at, reach: (M,) s, nan for no fit.
+    times: (N,) s, increasing.
+    values: (N, c).
+    at, reach: (M,) s, nan for no fit.
     """
     found = ~np.isnan(reach)
     if not found.any():
@@ -231,7 +235,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     weight_u2 = weight_u * u
     # normal equations of a + b u + c u², and the first two rows of their inverse by cofactors
     weight_u3 = weight_u2 * u
-    s0, s1, s2, s3, s4 = (np.add.reduce(each) for each in (weight, weight_u, weight_u2, weight_u3, weight_u3 * u))
+    s0, s1, s2, s3, s4 = (np.add.reduce(moment) for moment in (weight, weight_u, weight_u2, weight_u3, weight_u3 * u))
     c00, c01, c02 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
     c11, c12 = s0 * s4 - s2 * s2, s1 * s2 - s0 * s3
     determinant = s0 * c00 + s1 * c01 + s2 * c02

@@ -54,11 +54,14 @@ _NAN_4, _NAN_3 = (math.nan,) * 4, (math.nan,) * 3
 class LiveAlignment:
     """Alignment of three streams; `rows` is the result, `partners` counts the decided rows.
 
-    reference, imu: their recent samples. dropouts: of the DVL. lag_ns: largest lag between streams (in stamps),
-    including a wrong clock. day_rows, day_starts_ns: numbers and stamps of the first rows of new recordings. tally: by
-    stream and for pairing, see `Calibrator.counts`. on_restart: called with the backward step (s; negative: forward) of
-    DVL stamps after a reset. before_clearing: called before a track with a backward clock step is cleared, so that
-    users of its samples can copy them first.
+    reference, imu: their recent samples.
+    dropouts: of the DVL.
+    lag_ns: largest lag between streams (in stamps), including a wrong clock.
+    day_rows, day_starts_ns: numbers and stamps of the first rows of new recordings.
+    tally: by stream and for pairing, see `Calibrator.counts`.
+    on_restart: called with the backward step (s; negative: forward) of DVL stamps after a reset.
+    before_clearing: called before a track with a backward clock step is cleared, so that users of its samples can copy
+      them first.
     """
 
     def __init__(
@@ -68,6 +71,11 @@ class LiveAlignment:
         on_restart: Callable[[float], None] = lambda _: None,
         recordings_ns: Sequence[int] = (),
     ) -> None:
+        """Start without samples.
+
+        prior_sway_heave: (2,) m/s, prior for `prior_source: reference`.
+        recordings_ns: stamps between recordings.
+        """
         self.parameters = parameters
         self._prior_sway_heave = prior_sway_heave
         self._on_restart = on_restart
@@ -82,7 +90,7 @@ class LiveAlignment:
     # ------------------------------------------------------------------ state
 
     def reset(self) -> None:
-        """Discard all samples."""
+        """Discard all samples, and begin again with empty streams."""
         p = self.parameters
         self._first_stamp_ns: int | None = None
         # after the correction of its delay, a late-stamped stream lags the others by it
@@ -211,7 +219,7 @@ class LiveAlignment:
             self.partners.judge(rows.end, self.parameters)
 
     def take_reference(self, sample: ReferenceSample) -> None:
-        """Add a reference (GNSS) velocity."""
+        """Add a reference velocity, unless it is invalid, and count it."""
         tally = self.tally["reference"]
         tally["received"] += 1
         valid, _, unmeasured = self._reference_covariance(sample.covariance)
@@ -226,7 +234,7 @@ class LiveAlignment:
         self._keep(Stream.REFERENCE, sample)
 
     def take_imu(self, sample: ImuSample) -> None:
-        """Add attitude and angular velocity."""
+        """Add the attitude and angular velocity of a sample, unless both are invalid, and count it."""
         tally = self.tally["imu"]
         tally["received"] += 1
         stamp_ns, given, angular_velocity = sample
@@ -315,7 +323,10 @@ class LiveAlignment:
         self._on_restart(back_s)
 
     def _advance(self) -> None:
-        """Advance the rows whose partners are decided; note what the next ones wait for."""
+        """Pair the rows whose attitude and reference are decided, and note the stamps that the next rows wait for.
+
+        Attitudes are decided first, because a reference in an earth frame needs one.
+        """
         partners, end, horizon_ns = self.partners, self.rows.end, self.horizon_ns
         self._waits_for.clear()
         self._deadline_ns = NEVER_NS

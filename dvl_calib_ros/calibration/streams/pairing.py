@@ -32,8 +32,9 @@ def add_count(tally: Counter[str], name: str, count: int) -> None:
 class Pairer:
     """Pairing state of the rows of an aligner.
 
-    n_judged, n_oriented, n_paired: numbers of the first row without decided verdict, attitude or reference. given: by
-    need, number of rows available to models with that need. decided_ns: stamp of the newest row with decided reference.
+    n_judged, n_oriented, n_paired: numbers of the first row without decided verdict, attitude or reference.
+    given: by need, number of rows available to models with that need.
+    decided_ns: stamp of the newest row with decided reference.
     needs_turn_rate: verdicts wait for the angular velocity.
     """
 
@@ -46,6 +47,13 @@ class Pairer:
         tally: Mapping[str, Counter[str]],
         prior_sway_heave: tuple[float, float] | None,
     ) -> None:
+        """Start without rows.
+
+        rows: table of the DVL samples.
+        reference, imu: recent samples of these streams.
+        tally: counters by stream and for pairing.
+        prior_sway_heave: (2,) m/s, prior for `prior_source: reference`.
+        """
         self._rows, self._reference, self._imu, self._tally = rows, reference, imu, tally
         self._has_lever_arm = any(parameters.lever_arm)
         self.needs_turn_rate = self._has_lever_arm or parameters.max_turn_rate > 0.0
@@ -186,7 +194,7 @@ class Rows(RowTable):
         return AlignedBlock(*[getattr(self, name)[at] for name in _COLUMNS])
 
 
-_COLUMNS = [each.name for each in fields(AlignedBlock)]
+_COLUMNS = [column.name for column in fields(AlignedBlock)]
 
 
 class Gates:

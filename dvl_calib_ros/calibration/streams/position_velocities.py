@@ -32,16 +32,17 @@ def check_model(parameters: Parameters) -> None:
 def of_moments(times: Array, velocity: Array, imu: ImuColumns, parameters: Parameters) -> Array:
     """Correct mean velocities (N, 3) m/s over `position_window` to those at the middles (N,) s of the windows.
 
-    The configured lever arm's part is known from the attitude, whatever its frequency.
+    The attitude gives the part of the configured lever arm exactly; the rest is deconvolved (`_deconvolved`).
     """
     window_s, arm = parameters.position_window, np.array(parameters.lever_arm)
     if not arm.any() or len(times) < 2:
         return _deconvolved(times, velocity, window_s)
     middle, start, end = (attitude_at(imu, times + half, GAP_S) for half in (0.0, -0.5 * window_s, 0.5 * window_s))
     rates = angular_velocity_at(TurnRates.of(imu), times, GAP_S)
-    known = start[1] & end[1] & middle[1] & np.isfinite(rates).all(axis=1)
-    arm_mean = np.where(known[:, None], (end[0] - start[0]) @ arm / window_s, 0.0)
-    arm_velocity = np.where(known[:, None], np.einsum("nij,nj->ni", middle[0], cross(rates, arm)), 0.0)
+    (rotation, oriented), (first, starts), (last, ends) = middle, start, end
+    known = (starts & ends & oriented & np.isfinite(rates).all(axis=1))[:, None]
+    arm_mean = np.where(known, (last - first) @ arm / window_s, 0.0)
+    arm_velocity = np.where(known, np.einsum("nij,nj->ni", rotation, cross(rates, arm)), 0.0)
     return _deconvolved(times, velocity + arm_mean, window_s) - arm_velocity
 
 

@@ -41,7 +41,8 @@ def are_valid_velocities(velocity: Array, max_speed: float) -> Mask:
 class Screened(NamedTuple):
     """Screened covariance of a velocity.
 
-    valid: the sample may be used. covariance: (3, 3) (m/s)², symmetric positive definite; None if not given.
+    valid: the sample may be used.
+    covariance: (3, 3) (m/s)², symmetric positive definite; None if not given.
     unmeasured: a bit (1, 2, 4) per axis that is not measured; its variance in the covariance is a placeholder of 1.
     """
 
@@ -112,7 +113,9 @@ def screened_covariances(covariance: Array, believed: bool = True) -> ScreenedMa
 def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[bool, bool, bool]:
     """Return the measured axes of a reference: by most messages, by the parameter, and z not constantly 0.
 
-    velocity: (N, 3) m/s. unmeasured: (N,) as in `Screened`. gnss_axes: the parameter.
+    velocity: (N, 3) m/s.
+    unmeasured: (N,) as in `Screened`.
+    gnss_axes: the parameter.
     """
     unmeasured = np.where(unmeasured == ALL_AXES, 0, unmeasured)  # all unmeasured: no evidence per axis
     measured = [2 * np.count_nonzero(unmeasured & bit) < len(unmeasured) for bit in AXIS_BITS]

@@ -182,9 +182,9 @@ class Track(RowTable):
     """Recent samples of one stream, for interpolation without extrapolation.
 
     values: linearly interpolated quantities or, for an IMU, quaternion and angular velocity (samples.py); for a
-    reference velocity (3), covariance (9, nan where not given). frames, unmeasured: of a reference, its frame (index in
-    `FRAMES`) and a bit per axis that is not measured. late: at its arrival it lagged other streams by more than the
-    limit.
+      reference velocity (3), covariance (9, nan where not given).
+    frames, unmeasured: of a reference, its frame (index in `FRAMES`) and a bit per axis that is not measured.
+    late: at its arrival it lagged other streams by more than the limit.
     """
 
     stamps_ns: Stamps = column(np.int64)
@@ -196,7 +196,8 @@ class Track(RowTable):
     def __init__(self, max_gap_ns: int, max_latency_ns: int, retention_ns: int) -> None:
         """Make an empty track.
 
-        max_gap_ns: longest interpolated gap. max_latency_ns: lead of other streams at which waiting for this one ends.
+        max_gap_ns: longest interpolated gap.
+        max_latency_ns: lead of other streams at which waiting for this one ends.
         retention_ns: largest age of a time behind the newest sample.
         """
         super().__init__()
@@ -246,8 +247,10 @@ class Track(RowTable):
     ) -> Index:
         """Return the event (0..T-1, T: none) at which each of N times is `decided`.
 
-        stamps_ns: (N,) increasing. since: (N,) event from which each time is requested. new_ns: stamps of the samples
-        that this stream gains, arrived: their events. newest_ns, horizon_ns: (T,) after every event.
+        stamps_ns: (N,) increasing.
+        since: (N,) event from which each time is requested.
+        new_ns: stamps of the samples that this stream gains, arrived: their events.
+        newest_ns, horizon_ns: (T,) after every event.
         """
         n_events = len(horizon_ns)
         before_ns = LONG_AGO_NS if self.newest_ns is None else self.newest_ns
@@ -301,14 +304,14 @@ class Track(RowTable):
         if not len(stamps):
             nowhere = np.zeros(len(stamps_ns), dtype=np.intp)
             return Brackets(nowhere, nowhere, nowhere.astype(float), np.zeros(len(stamps_ns), dtype=bool))
-        at = np.minimum(np.searchsorted(stamps, stamps_ns), len(stamps) - 1)
-        after_ns = stamps[at]
-        gap_ns = np.where(at > 0, after_ns - stamps[np.maximum(at - 1, 0)], self.max_gap_ns + 1)
+        following = np.minimum(np.searchsorted(stamps, stamps_ns), len(stamps) - 1)
+        after_ns = stamps[following]
+        gap_ns = np.where(following > 0, after_ns - stamps[np.maximum(following - 1, 0)], self.max_gap_ns + 1)
         near = gap_ns <= self.max_gap_ns
         exact = after_ns == stamps_ns
         found = (stamps_ns <= newest_ns) & (stamps_ns >= newest_ns - self.retention_ns) & (exact | near)
         fraction = np.where(exact, 1.0, (stamps_ns - (after_ns - gap_ns)) / gap_ns)
-        after = at + self.begin
+        after = following + self.begin
         return Brackets(np.where(near, after - 1, -1), after, fraction, found)
 
 

@@ -29,10 +29,12 @@ Three = tuple[float, float, float]
 class DvlSeen:
     """A DVL on its vehicle, over all recordings.
 
-    mounting_rpy: (3,) rad, nominal, and lever_arm: (3,) m, both as configured, without the estimate. time_offset: s,
-    and clock_drift: s per s, configured corrections of its stamps. rate_hz: samples per second. noise_std: (3,) m/s,
-    per axis, from sample to sample, upper bound. speed: (3,) m/s, RMS along its axes. sizes: RMS, m/s, of the velocity
-    change by each error: `misalignment`, `scale`, effects, and repeated samples.
+    mounting_rpy: (3,) rad, nominal, and lever_arm: (3,) m, both as configured, without the estimate.
+    time_offset: s, and clock_drift: s per s, configured corrections of its stamps.
+    rate_hz: samples per second.
+    noise_std: (3,) m/s, per axis, from sample to sample, upper bound.
+    speed: (3,) m/s, RMS along its axes.
+    sizes: RMS, m/s, of the velocity change by each error: `misalignment`, `scale`, effects, and repeated samples.
     """
 
     mounting_rpy: Three

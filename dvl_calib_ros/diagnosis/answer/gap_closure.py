@@ -1,4 +1,7 @@
-"""Gap and closure: size of the error and share that the effects explain, on held-out data."""
+"""Gap and closure: size of the error and share that the effects explain, on held-out data.
+
+Shapes: F samples, M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +32,13 @@ Integers = NDArray[np.intp]
 class Gap:
     """Vector RMS, m/s, per sample, on held-out data. before, after: errors without and with effects, noise included.
 
-    noise_floor: from the residual, white and slow. closure: share of the noise-free error's energy that a correction
-    with the estimated effects closes, nan without a gap; interval: its 95 per cent, given the parameters' covariance.
-    not_explained: noise-free error that is not closed; without effects, the part of `after` above the noise. reported:
-    noise reported by the messages, None if missing. by_recording: before and after per recording, if several.
+    noise_floor: from the residual, white and slow.
+    closure: share of the noise-free error's energy that a correction with the estimated effects closes, nan without a
+      gap.
+    interval: its 95 per cent, given the parameters' covariance.
+    not_explained: noise-free error that is not closed; without effects, the part of `after` above the noise.
+    reported: noise reported by the messages, None if missing.
+    by_recording: before and after per recording, if several.
     left_open: predicted part of `after` above the noise, in stretches that alone determine parts of the effects.
     drift: of straight dead reckoning with errors before and after, None for a vehicle at rest.
     """

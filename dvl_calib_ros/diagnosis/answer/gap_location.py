@@ -1,4 +1,7 @@
-"""Location of the gap: axis, motion regime, stretch of time and frequency band."""
+"""Location of the gap: axis, motion regime, stretch of time and frequency band.
+
+Shapes: F samples, M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 

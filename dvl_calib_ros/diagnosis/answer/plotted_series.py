@@ -1,4 +1,7 @@
-"""Series of a diagnosis for its pictures."""
+"""Series of a diagnosis for its pictures.
+
+Shapes: F samples, M bins of time.
+"""
 
 from __future__ import annotations
 
@@ -68,11 +71,18 @@ class HeldOutTwin:
 class DiagnosisSeries:
     """F samples of all recordings, ahead, to port and up; zero on an axis that is not measured.
 
-    recordings: names. recording_of: (F,) index into them. time: (F,) s since the recording's start. segments: stretches
-    without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool. traces: by
-    effect (F, 3) m/s, as fitted, without the part that misalignment and scale absorb. phi: (3,) rad and scale: (3,),
-    calibration, DVL frame; calibration_std: (6,) of both. rest: tests of the residual. measured: (3,) axes that the
-    reference measures. by_regressor: residual against its regressor.
+    recordings: names.
+    recording_of: (F,) index into them.
+    time: (F,) s since the recording's start.
+    segments: stretches without a gap.
+    held_out: errors before and after the effects, and the noise.
+    regimes: name -> (F,) bool.
+    traces: by effect (F, 3) m/s, as fitted, without the part that misalignment and scale absorb.
+    phi: (3,) rad and scale: (3,), calibration, DVL frame.
+    calibration_std: (6,) of both.
+    rest: tests of the residual.
+    measured: (3,) axes that the reference measures.
+    by_regressor: residual against its regressor.
     """
 
     recordings: tuple[str, ...]

@@ -37,7 +37,9 @@ class FoundEffect:
     """Effect in the result. equivalent_to: effects that explain the data equally well. closure: of the gap, alone.
 
     parameters: value, low, high (95 per cent) by name; of parameters per recording the weighted mean, and by_recording
-    each one's. p: adjusted over the library. combination: observable combination of an ambiguous lever arm and clock.
+      each one's.
+    p: adjusted over the library.
+    combination: observable combination of an ambiguous lever arm and clock.
     """
 
     name: str

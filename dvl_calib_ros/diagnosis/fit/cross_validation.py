@@ -1,4 +1,7 @@
-"""Cross-validation over stretches of time or whole recordings."""
+"""Cross-validation over stretches of time or whole recordings.
+
+Shapes: M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Gauss-Newton fits of hypotheses in the composed model."""
+"""Gauss-Newton fits of hypotheses in the composed model.
+
+Shapes: M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 
@@ -305,7 +308,10 @@ class Fitter:
         return fit
 
     def _refine_event_time(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
-        """Move a time of an effect by ± `step` (s), if that lowers the deviance."""
+        """Return the fit with an effect's time moved by ± `step` (s), if that lowers the deviance.
+
+        name: of the time parameter. The predicted gain of the current fit is computed once, and again after a move.
+        """
         converged: tuple[Fit, float] | None = None
         for sign in (-1.0, 1.0):
             values = fit.values[effect.name]
@@ -331,10 +337,15 @@ class Fitter:
     def _is_surely_worse(
         self, hypothesis: Hypothesis, linearised: _Linearisation, noise: Noise, deviance: float, promised: float = 0.0
     ) -> bool:
-        """Return whether a hypothesis, fitted, would have a larger deviance, by one linear step.
+        """Return whether the fit of a hypothesis will surely exceed a deviance, judged by one linear step.
 
-        The step's predicted deviance is the minimum except for nonlinearity. promised: predicted gain from a nearby
-        converged fit of this deviance, subtracted as unattainable (`_predicted_gain`).
+        The deviance after the step is the minimum that a fit can reach, except for nonlinearity, for which a share of
+        the step's gain is allowed.
+
+        linearised: the hypothesis before the step.
+        deviance: of the fit to compare with.
+        promised: gain that a linear step predicts even from a converged fit nearby (`_predicted_gain`). No fit reaches
+          this gain, so it is not expected of the hypothesis either.
         """
         own_noise = self._own_noise(hypothesis, noise, linearised.residual + self.outliers)
         minimum = linearised.system.misfit(linearised.system.solution())

@@ -3,6 +3,8 @@
 The fitted model runs forwards on the recorded motion, at the recorded stamps. A simulated recording therefore has what
 a test's formulas omit: interpolated samples that share neighbours, and noisy regressors. Between slow samples, its
 motion differs from the diagnosis' interpolation.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations

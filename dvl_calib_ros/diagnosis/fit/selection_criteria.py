@@ -1,4 +1,7 @@
-"""Penalised deviance of a fit, and nuisance parameters."""
+"""Penalised deviance of a fit, and nuisance parameters.
+
+Shapes: M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 

@@ -10,6 +10,8 @@ seconds is a change of argument. e is averaged over bins of two intervals of the
 
 Regressors use the smoothed DVL velocity, whose noise is small. Regressors from the reference would bias estimates
 towards zero (errors in variables).
+
+Shapes: F samples, M bins of time, A compared axes.
 """
 
 from __future__ import annotations
@@ -157,7 +159,12 @@ class Problem:
         return np.concatenate(parts)[:, [axis for axis in range(3) if self.measured[axis]]]
 
     def projection(self, recording: RecordedStreams, rotation_enu_from_body: Array | None) -> Array:
-        """Return (F, A, 3) from the body frame to the compared axes: of the body, or levelled."""
+        """Return the matrices (F, A, 3) that select the compared axes from a body velocity.
+
+        If the reference measures all three axes, these are the body's (identity, F = 1). Else they are the measured
+        axes of the reference: of the body, of the earth, or horizontal ones ahead and to port for a measured east and
+        north. rotation_enu_from_body: (F, 3, 3), None if unknown.
+        """
         if all(self.measured):
             return np.eye(3)[None]
         rows = [axis for axis in range(3) if self.measured[axis]]
@@ -241,7 +248,11 @@ class Problem:
         return found
 
     def _moved(self, hypothesis: Hypothesis, recording: int, time: Array, unsmoothed: bool = False) -> _Moved:
-        """Return the DVL's motion at true times (F,) s. unsmoothed: without smoothing a slow DVL."""
+        """Return the motion by the DVL at true times (F,) s, under a hypothesis.
+
+        The measured velocity is rotated to the body. The hypothesis's effects on the DVL are then removed, then the
+        lever arm's velocity, then the effects on the motion. unsmoothed: without smoothing a slow DVL.
+        """
         stream, injections = self.recordings[recording], hypothesis.injections(recording)
         dvl, attitude = (time + late(injections, clock, time) for clock in (ActsOn.DVL_CLOCK, ActsOn.ATTITUDE_CLOCK))
         rotation, rates = self._oriented(stream, attitude)

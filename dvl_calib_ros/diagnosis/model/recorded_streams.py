@@ -100,11 +100,17 @@ PER_DVL_SAMPLE = 2.5
 class RecordedStreams:
     """Streams of one recording. Times in s since its first DVL stamp (first_ns).
 
-    name: of the bag. dvl: (N, 3) m/s, DVL frame. reference: (M, 3) m/s, in the earth (ENU) or the body by `frame`.
-    attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of continuous sign. rates: (G, 3) rad/s, body.
+    name: of the bag.
+    dvl: (N, 3) m/s, DVL frame.
+    reference: (M, 3) m/s, in the earth (ENU) or the body by `frame`.
+    attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of continuous sign.
+    rates: (G, 3) rad/s, body.
     dvl_std, reference_std: (3,) m/s, RMS of reported standard deviations, the reference's in its frame; None if not
-    reported. measured: (3,) axes that the reference measures. repeats: number of the `received` DVL samples that equal
-    the previous velocity; spikes: number of outliers removed. registration: initial guess, if known.
+      reported.
+    measured: (3,) axes that the reference measures.
+    repeats: number of the `received` DVL samples that equal the previous velocity.
+    spikes: number of outliers removed.
+    registration: initial guess, if known.
     backward_steps: of the DVL's clock.
     """
 
@@ -151,7 +157,11 @@ class RecordedStreams:
         return np.asarray(attitude.kept.at("rotation", at, rotation))
 
     def angular_velocity(self, at: Array) -> Array:
-        """Return (M, 3) rad/s, body: of the gyroscopes, or of the attitude if these are too slow."""
+        """Return the angular velocity (M, 3) rad/s, body axes, at times (M,) s.
+
+        It is that of the gyroscopes, or the derivative of the attitude if the gyroscopes are too slow. Results are
+        cached by the times.
+        """
         rates, attitude = self.rates, self.attitude
         if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
             own = rates.denoised

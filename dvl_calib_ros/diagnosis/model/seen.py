@@ -1,4 +1,7 @@
-"""Evaluation of a hypothesis for a recording, and derivatives of the residual."""
+"""Evaluation of a hypothesis for a recording, and derivatives of the residual.
+
+Shapes: F samples, A compared axes.
+"""
 
 from __future__ import annotations
 

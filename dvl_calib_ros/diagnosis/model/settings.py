@@ -17,10 +17,12 @@ class DiagnosisSettings:
     errors near its Nyquist frequency do not resemble a delay. Bins are at least shortest_bin long and at most max_bins
     in number. max_points: number of samples of a stream; longer recordings are averaged.
 
-    Finding: level: family-wise, of any effect. max_effects: largest number of effects. indistinguishable: deviance
-    within which two explanations are equivalent: for a rival better by d, the odds are those of a normal variable
-    beyond √d. robust_level: p under noise of any colour, of an effect by the scatter of blocks, and of each kind of
-    regressor that a residual may follow by held-out data.
+    Finding: level: family-wise, of any effect.
+    max_effects: largest number of effects.
+    indistinguishable: deviance within which two explanations are equivalent: for a rival better by d, the odds are
+      those of a normal variable beyond √d.
+    robust_level: p under noise of any colour, of an effect by the scatter of blocks, and of each kind of regressor that
+      a residual may follow by held-out data.
 
     outlying: robust standard deviations of an outlier. conclusive: deviance that leaves no doubt between two fits.
 

@@ -1,4 +1,7 @@
-"""Times at which the streams of a recording are compared."""
+"""Times at which the streams of a recording are compared.
+
+Shapes: F samples, M bins of time.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,10 @@ MOTION_INTERVAL_S = 0.1
 class Grid:
     """Times of the comparison: the samples of the rougher stream, which avoids interpolating it.
 
-    Interpolated noise depends on the phase, and motion between distant samples is lost. clock: of the rougher stream,
-    DVL_CLOCK or REFERENCE_CLOCK. stamps: (M * per_bin,) s, of that clock. delay_s: its delay from the initial guess.
+    Interpolated noise depends on the phase, and motion between distant samples is lost.
+    clock: of the rougher stream, DVL_CLOCK or REFERENCE_CLOCK.
+    stamps: (M * per_bin,) s, of that clock.
+    delay_s: its delay from the initial guess.
     """
 
     clock: ActsOn

@@ -1,4 +1,7 @@
-"""Noise level as a function of reported covariances per sample, speed and turn rate."""
+"""Noise level as a function of reported covariances per sample, speed and turn rate.
+
+Shapes: M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 

@@ -105,9 +105,11 @@ class Arma:
 class Noise:
     """Noise of M samples on A axes.
 
-    segments: ranges without a gap. rotation: (M, A, A), frame of the noise from the residual's, None if equal. level:
-    (M, A), relative standard deviation. axes: one ARMA each. memory: largest autocorrelation of neighbours: slower
-    variation is no noise.
+    segments: ranges without a gap.
+    rotation: (M, A, A), frame of the noise from the residual's, None if equal.
+    level: (M, A), relative standard deviation.
+    axes: one ARMA each.
+    memory: largest autocorrelation of neighbours: slower variation is no noise.
     """
 
     segments: tuple[slice, ...]

@@ -109,8 +109,10 @@ def orthonormal(white: Array) -> Array:
 class ScoreTest:
     """Normal equations of columns for a whitened series, orthogonal to a basis.
 
-    Basis and series may end with prior rows, which the columns lack. gram: (c, c) of unit columns after projection.
-    along: (c,) products with the series. nonzero: (c,) whether a column exceeds rounding after projection.
+    Basis and series may end with prior rows, which the columns lack.
+    gram: (c, c) of unit columns after projection.
+    along: (c,) products with the series.
+    nonzero: (c,) whether a column exceeds rounding after projection.
     """
 
     gram: Array

@@ -1,4 +1,7 @@
-"""Dictionary of functions of motion or time that a systematic residual may follow."""
+"""Dictionary of functions of motion or time that a systematic residual may follow.
+
+Shapes: M bins of time, A compared axes.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,10 @@ HEADING_HARMONICS = 4
 class Regressor(NamedTuple):
     """What a residual may follow, with its test.
 
-    about: its name, or a period (s). columns: (M, A, c). energy: chi-square of dof under the null, once divided by its
-    inflation in simulated recordings. log_tried: logarithm of the number of alternatives, such as times of an event.
+    about: its name, or a period (s).
+    columns: (M, A, c).
+    energy: chi-square of dof under the null, once divided by its inflation in simulated recordings.
+    log_tried: logarithm of the number of alternatives, such as times of an event.
     left: deviance that inexact interpolation may leave, where no simulated recordings tell.
     """
 

@@ -33,7 +33,10 @@ AMBIGUITY_M = 0.1
 class Combination:
     """Observable combination of an ambiguous lever arm and clock: the arm minus speed times delay.
 
-    parameter: of the arm. clock: name of the effect. speed: m/s. value: m, with its 95 per cent interval.
+    parameter: of the arm.
+    clock: name of the effect.
+    speed: m/s.
+    value: m, with its 95 per cent interval.
     """
 
     parameter: str

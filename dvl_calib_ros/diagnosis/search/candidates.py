@@ -2,6 +2,8 @@
 
 Linearised about a fit, all effects share one Gram matrix. Combinations of up to three effects are small least squares
 problems in it.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations
@@ -175,8 +177,10 @@ def linearised(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Linea
 
 
 def _gram(problem: Problem, noise: Noise, columns: Array, target: Array) -> Array:
-    """Return the Gram matrix (n + 1, n + 1) of whitened columns (M, A, n) and target (M, A), summed by recording. A
-    recording's own parameters have zero columns in others."""
+    """Return the Gram matrix (n + 1, n + 1) of whitened columns (M, A, n) and target (M, A), summed by recording.
+
+    A parameter of one recording has a zero column in the others. Zero columns are left out, because whitening is slow.
+    """
     total = np.zeros((columns.shape[2] + 1,) * 2)
     for rows in problem.rows_of:
         part, noise_of = columns[rows], noise.part(rows)
@@ -195,7 +199,13 @@ def _std(effect: Effect, p: int, n_recordings: int) -> Array:
 
 
 def _shortlisted(table: LinearisedModel, present: Sequence[int], cost: Sequence[float]) -> list[int]:
-    """Return all variants of the fit and the most promising others, alone or in addition."""
+    """Return the indices of all variants of the fit, and of the most promising others.
+
+    A variant is promising by its gain in deviance, less its cost: in addition to the fit, or with less weight instead
+    of an effect of the fit or alone. At most KEPT_VARIANTS of one effect are kept.
+
+    present: indices of the variants of the fit. cost: price of each variant.
+    """
     misfit, empty_misfit = table.misfit(present), table.misfit([])
     gains: dict[int, float] = {}
     adds: dict[int, float] = {}

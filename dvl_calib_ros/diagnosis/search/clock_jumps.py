@@ -188,7 +188,11 @@ def _squares(fitter: Fitter, fit: Fit, kept: Sequence[Effect], clock: Effect) ->
 
 
 def _best_delays(squares: Array) -> Delays:
-    """Return the delays with no, one or two jumps; each jump must reduce the squares enough."""
+    """Return the delay of each part of the run, with no, one or two jumps between the parts.
+
+    squares: (D, P) sums of whitened squares for each of `DELAYS` and each of P short parts of the run.
+    A jump is kept if it reduces the sum of squares by more than `SETTINGS.conclusive`.
+    """
     cumulative = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
     n = squares.shape[1]
 

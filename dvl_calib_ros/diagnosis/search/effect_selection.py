@@ -11,6 +11,8 @@ moving mountings are rare, so the heading is named first, unless the same headin
 
 An outlier of a fast stream is found from its neighbours. A vehicle can turn between the samples of a slow stream: an
 outlier there must also contradict the other stream, by as much and in the same direction.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ ROBUST_ROUNDS = 3
 class EffectSelection:
     """Selected effects, strongest first, with the fits without (`base`) and with them under the same noise.
 
-    testable: effects with their observable parameters. trade_off: ambiguity of lever arm and clock at one speed.
+    testable: effects with their observable parameters.
+    trade_off: ambiguity of lever arm and clock at one speed.
     changes: by arm parameter, the difference (m) to a fit with another clock that explains the data equally well.
     wider: the hypothesis with effects that slow noise explains equally well.
     """

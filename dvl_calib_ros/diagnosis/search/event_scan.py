@@ -2,6 +2,8 @@
 
 A beam that drops out switches an error on or off. A magnetic anomaly rotates the heading while the vehicle passes. The
 slow noise absorbs such an error unless the time of the event is searched.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations

@@ -142,9 +142,9 @@ def _clock_or_arm(
 ) -> list[Selected]:
     """Merge lever arm and clock into one entry if each is insignificant given the other.
 
-    selection: selected effects; a further clock is named only if significant. trade_off: from `arm_ambiguity`; a
-    reference delay within that ambiguity is insignificant. clear: from `separable_clocks`; an insignificant arm is no
-    alternative to these clocks.
+    selection: selected effects; a further clock is named only if significant.
+    trade_off: from `arm_ambiguity`; a reference delay within that ambiguity is insignificant.
+    clear: from `separable_clocks`; an insignificant arm is no alternative to these clocks.
     """
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 

@@ -2,6 +2,8 @@
 
 Score tests against a dictionary of regressors, each with a free vector in the body frame, propose. Prediction of
 held-out stretches decides, with the noise re-estimated beside the regressor: slow noise is the rival explanation.
+
+Shapes: M bins of time, A compared axes.
 """
 
 from __future__ import annotations
@@ -48,8 +50,10 @@ GROUP_RESIDUAL_SHARE = 0.02
 class Unexplained:
     """What a residual follows.
 
-    log_p: of the regressor's gain on held-out data, adjusted for its alternatives. about: name of the regressor, or a
-    period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest: (M, A, c), of the regressor.
+    log_p: of the regressor's gain on held-out data, adjusted for its alternatives.
+    about: name of the regressor, or a period (s).
+    columns: (M, A, f), the dictionary; empty if insignificant.
+    clearest: (M, A, c), of the regressor.
     log_tried: logarithm of its alternatives.
     """
 

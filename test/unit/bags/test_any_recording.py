@@ -314,7 +314,7 @@ def test_messages_in_big_endian_or_with_padding_are_read_as_they_are(tmp_path, c
     ("change", "reason"),
     [
         (lambda data: data + b"\xff" * 4, "it is longer than a sensor_msgs/msg/Imu"),
-        (lambda data: b"\0\7" + data[2:], "it begins with 00 07, plain CDR with 00 00 or 00 01"),
+        (lambda data: b"\0\7" + data[2:], "it begins with 00 07, but plain CDR begins with 00 00 or 00 01"),
         (lambda data: data[:60], "Could not deserialize"),
     ],
 )

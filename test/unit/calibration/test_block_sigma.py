@@ -104,7 +104,7 @@ def level_course(offset: tuple[float, float], headings: bool, wander: float = 0.
 
 def test_on_one_heading_it_is_said_what_a_constant_error_would_be():
     (said,) = one_heading_warnings(on_course((0.0, 0.0), headings=False).estimate("full"), CLAIMED, 1.5)
-    assert said.code == "ONE_HEADING" and "0.02 m/s would be 0.8° or 1.3 %" in said.says
+    assert said.code == "ONE_HEADING" and "0.02 m/s like 0.8° or 1.3 %" in said.says
     for name, headings in (("full", True), ("M3", False)):
         assert one_heading_warnings(on_course((0.0, 0.0), headings).estimate(name), CLAIMED, 1.5) == []
 

@@ -20,7 +20,7 @@ def kept():
 
 
 def test_all_that_blocks_are_registered_and_judged_by_is_kept(kept):
-    seen = registration_schedule._Registered()
+    seen = registration_schedule._NewestBlocks()
     for each in kept:
         seen.add(each)
     motion = seen.motion()
@@ -36,7 +36,7 @@ def test_all_that_blocks_are_registered_and_judged_by_is_kept(kept):
 
 def test_of_more_blocks_the_newest_are_kept_and_room_does_not_grow(kept, monkeypatch):
     monkeypatch.setattr(registration_schedule, "KEPT_BLOCKS", 5)
-    seen = registration_schedule._Registered()
+    seen = registration_schedule._NewestBlocks()
     seen.take_room()
     for each in [*kept, *kept]:
         seen.add(each)

@@ -8,7 +8,7 @@ import pytest
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.block_estimator import FullEstimator
 from dvl_calib_ros.calibration.estimators.full_fit import KEPT_BLOCKS
-from dvl_calib_ros.calibration.estimators.registration_schedule import ROWS_PER_BLOCK, KeptClocks
+from dvl_calib_ros.calibration.estimators.registration_schedule import ROWS_PER_BLOCK, RegistrationSchedule
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.numerics.tables import RowTable, column
@@ -85,8 +85,8 @@ def test_live_the_room_for_samples_is_taken_before_they_come(rate_hz, until_s):
 
 
 def test_what_is_registered_live_is_of_the_newest_blocks_in_memory_that_is_taken_at_once():
-    clocks = KeptClocks(Parameters(), live=True)
-    streams = clocks._seen._streams
+    clocks = RegistrationSchedule(Parameters(), live=True)
+    streams = clocks._newest._streams
     memory = [stream.times for stream in streams]
     n = ROWS_PER_BLOCK
     for number in range(2 * KEPT_BLOCKS + 20):
@@ -101,5 +101,5 @@ def test_what_is_registered_live_is_of_the_newest_blocks_in_memory_that_is_taken
         clocks.add(kept, np.zeros(n, dtype=np.uint8), number)
         oldest = 10.0 * max(0, number + 1 - KEPT_BLOCKS)
         assert all(stream.times[stream.begin] == oldest for stream in streams)
-    assert len(clocks._seen) == KEPT_BLOCKS
+    assert len(clocks._newest) == KEPT_BLOCKS
     assert all(stream.times is own for stream, own in zip(streams, memory, strict=True))

@@ -9,13 +9,13 @@ import pytest
 
 from dvl_calib_ros.discovery.topic_choice import choose_dvl, choose_imu, choose_reference, may_be_dvl
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
-from dvl_calib_ros.recordings.topic_preview import Look, Survey
+from dvl_calib_ros.recordings.topic_preview import Preview, Survey
 
 
 def survey(*topics: str, msgtype: str = TWIST_TYPE) -> Survey:
     """Topics in the order in which a recording has them, alike in all but their names."""
     values = np.tile([1.0, 0.0, 0.0] if msgtype == TWIST_TYPE else [0.0] * 10, (10, 1))
-    looks = {each: Look(each, msgtype, 10, 5.0, "", np.arange(10.0), 0.0, values) for each in topics}
+    looks = {each: Preview(each, msgtype, 10, 5.0, "", np.arange(10.0), 0.0, values) for each in topics}
     return Survey(dict.fromkeys(topics, msgtype), dict.fromkeys(topics, 10), looks, (), ())
 
 

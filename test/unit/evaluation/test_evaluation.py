@@ -354,7 +354,7 @@ def test_without_a_folder_the_command_says_that_the_trajectories_are_its_own(cap
         (["--seeds", "0"], "--seeds: 0 is outside"),
         (["--jobs", "-2"], "--jobs: -2 is negative"),
         (["--json", "no/such/e.json"], "no/such"),
-        (["--json", "same", "--csv", "same"], "--json and --csv: both name same"),
+        (["--json", "same", "--csv", "same"], "--json and --csv: both write same"),
         (["nowhere"], "nowhere: no such file or folder"),
         (["-p", "gnss_aided_std:=-1.0"], "gnss_aided_std"),
     ],

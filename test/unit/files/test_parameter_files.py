@@ -124,7 +124,7 @@ def test_what_is_wrong_in_a_file_is_said_with_the_name_of_file_and_parameter(tmp
         (b"- a\n- b\n", "no ROS 2 parameter file"),
         (b"/**: [\n  x: {\n", "not valid YAML"),
         (b"/**:\n\tros__parameters: 1\n", "not valid YAML"),
-        (b"/**: {ros__parameters: {base_frame: \xff\xfe}}", "no ROS 2 parameter file, not text"),
+        (b"/**: {ros__parameters: {base_frame: \xff\xfe}}", "no ROS 2 parameter file, because it is not text"),
         (bytes(range(256)), "no ROS 2 parameter file"),
         (b"\x00\x01\x02", "not valid YAML"),
         (b"dvl_calibratoin: {ros__parameters: {min_speed: 0.5}}", "only for dvl_calibratoin"),

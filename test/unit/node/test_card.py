@@ -148,7 +148,7 @@ def test_a_dvl_that_is_silent_or_far_ahead_by_one_stamp_makes_nothing_good_enoug
     assert {each["next code"] for each in looks(card, at_the_goal, [1.0] * 10)} == {"NEXT_STANDS"}
     silent = list(looks(card, at_the_goal, [1.0] * 300, rate=0.0, since_s=9.0))
     assert {each["next code"] for each in silent} == {"NEXT_STANDS"} and silent[-1]["seconds"] == "21"
-    assert len(card._worth._looks) <= STANDS_S  # what is kept stays bounded
+    assert len(card._worth._drifts) <= STANDS_S  # what is kept stays bounded
     ahead = next(looks(card, at_the_goal, [1.0], since_s=1e6))
     assert ahead["next code"] == "NEXT_STANDS"
 
@@ -179,9 +179,9 @@ def test_a_sigma_that_has_grown_for_good_takes_good_enough_back_and_says_so_unti
 def test_another_model_takes_good_enough_back_at_once_and_is_named():
     worth, drift = RecentWorth(), PredictedDrift(1.0, 1.0, 1.4)
     for second in range(40):
-        worth.look("full", drift, 2.0, float(second), rejected=False)
+        worth.add("full", drift, 2.0, float(second), rejected=False)
     assert worth.is_good and worth.taken_back is None
-    worth.look("unaided", drift, 2.0, 40.0, rejected=False)
+    worth.add("unaided", drift, 2.0, 40.0, rejected=False)
     assert not worth.is_good and "unaided" in worth.taken_back.sentence and worth.seconds_left(41.0) == STANDS_S - 1.0
 
 
@@ -205,7 +205,7 @@ def told_of(predictions, drifts):
     remaining, latest, told = RemainingTime(), math.inf, []
     for number, (seconds, drift) in enumerate(zip(predictions, drifts, strict=True)):
         now_s = 5.0 * number
-        left = remaining.look(seconds, drift, now_s)
+        left = remaining.add(seconds, drift, now_s)
         code = "" if remaining.longer is None else remaining.longer.code
         told.append((now_s, left, latest, code))
         end_s = math.inf if left is None else now_s + left

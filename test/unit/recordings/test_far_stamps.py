@@ -94,7 +94,7 @@ def test_a_recording_without_far_stamps_is_the_one_that_was_opened(tmp_path):
     [note] = found.notes
     assert "dvl/twist: 1 of 100 messages are set aside: stamped at 1970-01-01 00:00:05 UTC" in note
     assert not sound.notes
-    assert found.counts["dvl/twist"] == sound.counts["dvl/twist"] - 1 == found.survey.looks["dvl/twist"].count
+    assert found.counts["dvl/twist"] == sound.counts["dvl/twist"] - 1 == found.survey.previews["dvl/twist"].count
     own, other = (each.recorded("dvl/twist", Parameters()) for each in (found, sound))
     np.testing.assert_array_equal(own.stamps_ns, np.delete(other.stamps_ns, 3))
     np.testing.assert_array_equal(own.values, np.delete(other.values, 3, axis=0))
@@ -143,7 +143,7 @@ def test_one_log_time_does_not_stretch_a_recording(tmp_path, topic, off, storage
     assert recording.span_ns == (messages[0][1], messages[-1][1])
     [note] = recording.notes
     assert f"{topic}: 1 of " in note and "set aside: recorded at" in note
-    for name, look in recording.survey.looks.items():
+    for name, look in recording.survey.previews.items():
         expected = sum(each == name for each, *_ in messages) / 20.0
         assert look.rate_hz == pytest.approx(expected, rel=0.03), name
 

@@ -81,10 +81,10 @@ def test_of_all_messages_of_a_fast_topic_no_more_are_looked_at_than_frames_need_
     write_bag(tmp_path / "bag", run())
     recording = open_recording([tmp_path / "bag"])
     topics = Topics().found_in(recording.types)
-    whole = recording.whole(topics).looks[topics.imu]
+    whole = recording.whole(topics).previews[topics.imu]
     assert len(whole.stamps_s) > 100
     monkeypatch.setattr(looking, "MOST", 100)
     step = -(-recording.counts[topics.imu] // 100)
-    some = recording.whole(topics).looks[topics.imu]
+    some = recording.whole(topics).previews[topics.imu]
     np.testing.assert_array_equal(some.stamps_s, whole.stamps_s[::step])
     np.testing.assert_array_equal(some.values, whole.values[::step])

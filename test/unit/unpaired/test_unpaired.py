@@ -352,7 +352,7 @@ def test_what_no_round_corrects_is_told_with_what_was_found(compared):
     corrected = replace(compared, effects=(leap,), rungs=rungs)
     closed = ClosedGap((Round(compared), Round(corrected, {"effects": [{"name": "lever_arm"}]})))
     assert [each.code for each in closed.reasons][:3] == ["SIMULATOR_ROUNDS", "SIMULATOR_LACKS", "SIMULATOR_NOT_ADDED"]
-    assert closed.reasons[2].sentence == "no round corrects time_offset_jump"
+    assert closed.reasons[2].sentence == "no round of corrections can remove time_offset_jump"
 
 
 @pytest.mark.slow
