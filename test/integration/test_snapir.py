@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvl_calib_ros.bag_replay.checked_replay import checked_replay
 from dvl_calib_ros.bag_replay.replay import extrinsics_of_replay, replay
 from dvl_calib_ros.calibration.comparison.mounting_change import compare
 from dvl_calib_ros.calibration.models import MODELS, Needs
@@ -119,36 +118,6 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
     assert np.sqrt(np.mean(error**2)) < 0.38
     assert 0.6 < np.sqrt(np.mean(scaled**2)) < 1.0
     assert selected.count("unaided") >= 9
-
-
-@pytest.mark.spread(1)
-@pytest.mark.parametrize("name", ["T05", "T13"])
-def test_an_ins_that_lags_half_a_second_is_no_filter_of_the_dvl(snapir_ins, tmp_path, name):
-    """T05 shows an arm of 1.6 m, and T13 no angle that could be off: neither has been found to have nothing wrong."""
-    files = (snapir_ins / f"{name}_{kind}.csv" for kind in ("dvl", "gnss", "attitude"))
-    import_recording(*files, tmp_path / name, ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01))
-    result = checked_replay([tmp_path / name], Parameters()).result
-    assert result.verifications[result.selected].verdict.value == "accept"
-
-
-@pytest.mark.slow
-def test_three_recordings_together_are_accepted_with_one_lever_arm_and_a_delay_for_each(snapir_ins, tmp_path):
-    """Their clocks are 0.9 s apart from day to day; one delay for all was rejected."""
-    bags = []
-    for day, name in enumerate(("T01", "T03", "T05")):
-        files = (snapir_ins / f"{name}_{kind}.csv" for kind in ("dvl", "gnss", "attitude"))
-        start = 1_700_000_000.0 + 86_400.0 * day
-        options = ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01, start=start)
-        import_recording(*files, tmp_path / name, options)
-        bags.append(tmp_path / name)
-    replayed = checked_replay(bags, Parameters())
-    result = replayed.result
-    verification = result.verifications["full"]
-    assert result.selected == "full" and verification.verdict.value == "accept"
-    assert verification.held_out.corrected < 0.025
-    assert abs(result.estimate.lever_arm((0.0, 0.0, 0.0))[0] + 1.85) < 0.03
-    found = {day.name: round(day.dvl_time_offset, 2) for day in result.days}
-    assert found == pytest.approx({"T01": -1.43, "T03": -1.49, "T05": -0.52}, abs=0.05)
 
 
 @pytest.mark.slow
