@@ -12,7 +12,7 @@ from dvl_calib_ros.bag_replay.replay import extrinsics_of_replay, replay
 from dvl_calib_ros.calibration.comparison.mounting_change import compare
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation
+from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
 from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording, read_columns
 from dvl_calib_ros.simulation.sensors import measure_dvl, measure_gnss
@@ -56,37 +56,6 @@ def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, t
             assert given - 25 < estimate.used + estimate.gated <= given
         else:
             assert estimate.used + estimate.gated == given
-
-
-@pytest.mark.slow
-def test_calibrating_on_t12_corrects_the_other_fourteen_as_published(trajectories, tmp_path, rng):
-    """Set E1 of the protocol, with default parameters: M7 at most 0.066 m/s, M3 and M4 at most 0.045 m/s."""
-    time, velocity = trajectories["T12"]
-    errors_of: dict[str, list[float]] = {name: [] for name in ["uncalibrated", *MODELS]}
-    for number, errors in enumerate(COMBINATIONS):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        result, _ = calibrate_on(folder, time[:200], velocity[:200], errors, rng)
-        residuals: dict[str, list[float]] = {name: [] for name in errors_of}
-        for name in set(TRAJECTORIES) - {"T12"}:
-            truth = trajectories[name][1] @ FLU_FROM_FRD
-            measured = measure_dvl(trajectories[name][1], errors, np.eye(3), rng) @ FLU_FROM_FRD
-            residuals["uncalibrated"].append(vector_rmse(measured - truth))
-            for model, estimate in result.estimates.items():
-                corrected = estimate.corrected_velocity(measured, np.eye(3))
-                residuals[model].append(vector_rmse(corrected - truth))
-        for model, values in residuals.items():
-            errors_of[model].append(float(np.mean(values)))
-    average = {model: float(np.mean(values)) for model, values in errors_of.items()}
-    print("Avg.VRMSE of E1, m/s:", {model: round(value, 4) for model, value in average.items()})
-    assert average["uncalibrated"] == pytest.approx(0.119, abs=0.001)
-    assert average["M7"] <= 0.066
-    assert average["M3"] <= 0.045
-    assert average["M4"] <= 0.045
-
-
-def vector_rmse(error) -> float:
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
 # Yaw of the vehicle's DVL, deg: what full says with the INS as reference on T01 T03 T05 T13, -0.02 to 0.22.
