@@ -48,6 +48,12 @@ def contents(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((out / "rows").iterdir())}
 
 
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch) -> None:
+    """But for those of `made`, which are looked at."""
+    drawn(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def dives(tmp_path_factory) -> Path:
     return write_fleet(tmp_path_factory.mktemp("fleet") / "dives")
@@ -164,7 +170,6 @@ def test_recordings_of_one_day_share_what_differs_from_day_to_day(tmp_path):
 
 @pytest.mark.slow
 def test_what_is_done_and_unchanged_is_not_done_again(dives, tmp_path, monkeypatch):
-    drawn(monkeypatch)  # they are looked at elsewhere
     place, out = tmp_path / "dives", tmp_path / "out"
     shutil.copytree(dives / "auv1", place / "auv1")
     done: list[str] = []
@@ -206,7 +211,6 @@ def test_what_failed_by_the_machine_is_tried_again(dives, tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_a_recording_whose_name_is_no_text_or_that_is_gone_costs_its_row(dives, tmp_path, monkeypatch):
-    drawn(monkeypatch)  # they are looked at elsewhere
     place = tmp_path / "dives"
     shutil.copytree(dives / "auv1", place / "auv1")
     os.rename(place / "auv1" / "dive1", os.fsencode(place / "auv1") + b"/dive\xff")
@@ -327,8 +331,7 @@ def test_the_same_data_in_two_places_is_used_once(dives, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_object_store_gives_what_its_files_give(made, dives, tmp_path, capsys, monkeypatch):
-    drawn(monkeypatch)  # they are looked at elsewhere
+def test_an_object_store_gives_what_its_files_give(made, dives, tmp_path, capsys):
     fsspec = pytest.importorskip("fsspec")
     store = fsspec.filesystem("memory")
     store.put(str(dives), "/bucket/dives", recursive=True)
@@ -350,8 +353,7 @@ def test_an_object_store_gives_what_its_files_give(made, dives, tmp_path, capsys
     assert "memory:///bucket/dives/auv2/no.mcap: " in "".join(one.error.dropna())
 
 
-def test_the_command_prints_the_answer_and_who_needs_a_person(made, dives, tmp_path, monkeypatch, capsys):
-    drawn(monkeypatch)  # they are looked at elsewhere
+def test_the_command_prints_the_answer_and_who_needs_a_person(made, dives, tmp_path, capsys):
     shutil.copytree(made[1], tmp_path / "out")
     said, _ = succeed(capsys, "fleet", dives, "--out", tmp_path / "out", "--jobs", "1")
     assert said.startswith("not compared") or said.startswith("moved")
