@@ -66,7 +66,7 @@ def test_rows_up_to_what_was_reserved_need_no_more_memory():
     assert table.number is memory
 
 
-@pytest.mark.parametrize(("rate_hz", "until_s"), [(5, 80), pytest.param(200, 35, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("rate_hz", "until_s"), [(5, 80), pytest.param(200, 50, marks=pytest.mark.slow)])
 def test_live_the_room_for_samples_is_taken_before_they_come(rate_hz, until_s):
     calibrator = Calibrator(Parameters())
     (keeper,) = (each for each in calibrator._further if isinstance(each, FullEstimator))
