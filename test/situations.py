@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -241,7 +241,7 @@ def ensembles(path: Path, yaw_deg: float = 0.0, bed_mps: Array | None = None) ->
 
 def lines(path: Path) -> Path:
     """Import the lines of text (PD6) that a DVL with a compass writes."""
-    told, written = Told(motion=long_motion()), ""
+    told, written = Told(motion=five_minutes()), ""
     ypr = np.degrees(Rotation.from_matrix(told.motion.rotation_enu_from_body).as_euler("ZYX"))
     for i, stamp in told.every(4.0):
         at = datetime.fromtimestamp(1e-9 * stamp, timezone.utc)
@@ -261,8 +261,11 @@ def imported(path: Path, log: bytes) -> Path:
 
 
 @cache
-def long_motion() -> Motion:
-    return make_motion("free", 420.0, 100.0, np.random.default_rng(12))
+def long_motion(seconds: float = 420.0) -> Motion:
+    return make_motion("free", seconds, 100.0, np.random.default_rng(12))
+
+
+five_minutes = partial(long_motion, 300.0)
 
 
 @dataclass(frozen=True)
@@ -326,9 +329,9 @@ NOISY = "accept", "marginal"  # speed over ground is noisy, and without a refere
 SITUATIONS = {
     "meaningless covariances": Situation(told_by(meaningless_covariances)),
     "one axis negated": Situation(
-        told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate z in the DVL's driver"
+        told_by(one_axis_negated, five_minutes), "DVL_LEFT_HANDED", "negate z in the DVL's driver"
     ),
-    "one beam low": Situation(told_by(one_beam_low, long_motion), "BEAM_OFF", "135° to port"),
+    "one beam low": Situation(told_by(one_beam_low, five_minutes), "BEAM_OFF", "135° to port"),
     "one beam low, which looks like a misalignment": Situation(
         told_by(one_beam_low_at_5_degrees, long_motion), "BEAM_OFF", "180° to port", yaw_deg=5.0, verdicts=("reject",)
     ),
@@ -381,7 +384,7 @@ SITUATIONS = {
         verdicts=NOISY,
     ),
     "attitude inverted": Situation(
-        told_by(attitude_inverted, long_motion), "GRAVITY_FITS_INVERTED", "correct the IMU's driver"
+        told_by(attitude_inverted, five_minutes), "GRAVITY_FITS_INVERTED", "correct the IMU's driver"
     ),
     "astern without reference": Situation(
         told_by(astern_by_its_transform),
@@ -391,7 +394,7 @@ SITUATIONS = {
         verdicts=NOISY,
     ),
     "stamps a minute and a half ahead": Situation(
-        told_by(stamps_a_minute_and_a_half_ahead, long_motion), "CLOCK_FAR", "--restamp log"
+        told_by(stamps_a_minute_and_a_half_ahead, five_minutes), "CLOCK_FAR", "--restamp log"
     ),
     "stamps an hour ahead": Situation(told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log"),
     "alignment of an RDI": Situation(lambda path, _: ensembles(path, -45.0), yaw_deg=-45.0, verdicts=NOISY),
@@ -402,6 +405,6 @@ SITUATIONS = {
         verdicts=NOISY,
     ),
     "text of a DVL": Situation(lambda path, _: lines(path), verdicts=NOISY),
-    "antenna on a mast": Situation(told_by(antenna_on_a_mast, long_motion), verdicts=NOISY),
-    "fixes around a dive": Situation(told_by(fixes_around_a_dive, long_motion), verdicts=NOISY),
+    "antenna on a mast": Situation(told_by(antenna_on_a_mast, five_minutes), verdicts=NOISY),
+    "fixes around a dive": Situation(told_by(fixes_around_a_dive, five_minutes), verdicts=NOISY),
 }

@@ -75,12 +75,14 @@ class Told:
 
     # ------------------------------------------------------------------ sensors
 
-    def dvl_velocity(self, i: int, mounting_rpy: tuple[float, ...]) -> Array:
-        """What the DVL measures in its forward-left-up axes, m/s."""
+    def dvl_velocities(self, places: list[int], mounting_rpy: tuple[float, ...]) -> Array:
+        """What the DVL measures in its forward-left-up axes, (N, 3) m/s."""
         m = self.motion
-        at_dvl = m.velocity_body[i] + cross(m.angular_velocity[i], np.array(LEVER_ARM))
-        body_from_dvl = true_mounting(mounting_rpy)
-        return body_from_dvl.T @ at_dvl + self.rng.normal(0.0, DVL_STD, 3)
+        at_dvl = m.velocity_body[places] + cross(m.angular_velocity[places], np.array(LEVER_ARM))
+        return at_dvl @ true_mounting(mounting_rpy) + self.rng.normal(0.0, DVL_STD, (len(places), 3))
+
+    def dvl_velocity(self, i: int, mounting_rpy: tuple[float, ...]) -> Array:
+        return self.dvl_velocities([i], mounting_rpy)[0]
 
     def dvl(
         self,
@@ -92,10 +94,11 @@ class Told:
         frd: bool = False,
     ) -> None:
         """A DVL; the driver types turn to forward-right-down themselves. frd: this one does so in any type."""
-        for i, stamp in self.every(rate_hz):
-            velocity = self.dvl_velocity(i, mounting_rpy)
-            if frd:
-                velocity = FLU_FROM_FRD @ velocity
+        each = self.every(rate_hz)
+        velocities = self.dvl_velocities([i for i, _ in each], mounting_rpy)
+        if frd:
+            velocities = velocities @ FLU_FROM_FRD.T
+        for (_, stamp), velocity in zip(each, velocities, strict=True):
             sample = Sample(stamp, velocity, DVL_STD**2 * np.eye(3))
             self.say(stamp, topic, kind, self.make.velocity(kind, sample, frame))
 
@@ -111,13 +114,15 @@ class Told:
     ) -> None:
         """The velocity of the body's origin, axes: enu, ned or body."""
         m = self.motion
-        for i, stamp in self.every(rate_hz, 0.04):
-            velocity = m.velocity_body[i]
-            if axes != "body":
-                velocity = m.rotation_enu_from_body[i] @ velocity
-            if axes == "ned":
-                velocity = ENU_FROM_NED.T @ velocity
-            velocity = velocity + self.rng.normal(0.0, std, 3)
+        each = self.every(rate_hz, 0.04)
+        places = [i for i, _ in each]
+        velocities = m.velocity_body[places]
+        if axes != "body":
+            velocities = np.einsum("nij,nj->ni", m.rotation_enu_from_body[places], velocities)
+        if axes == "ned":
+            velocities = velocities @ ENU_FROM_NED
+        velocities = velocities + self.rng.normal(0.0, std, velocities.shape)
+        for (_, stamp), velocity in zip(each, velocities, strict=True):
             sample = Sample(stamp, velocity, std**2 * np.eye(3) if covariance else None)
             self.say(stamp, topic, kind, self.make.velocity(kind, sample, frame))
 
@@ -135,13 +140,15 @@ class Told:
         body_from_imu = np.eye(3) if mounting is None else mounting
         world_from_enu = ENU_FROM_NED.T if world == "ned" else np.eye(3)
         each = self.every(rate_hz)
-        rotations = [world_from_enu @ m.rotation_enu_from_body[i] @ body_from_imu for i, _ in each]
+        places = [i for i, _ in each]
+        rotations = world_from_enu @ m.rotation_enu_from_body[places] @ body_from_imu
         quaternions = Rotation.from_matrix(rotations).as_quat()  # one by one takes as long as all else
-        for (i, stamp), rotation, quaternion in zip(each, rotations, quaternions, strict=True):
-            message = self.make.imu(Oriented(stamp, quaternion, body_from_imu.T @ m.angular_velocity[i]))
+        rates = m.angular_velocity[places] @ body_from_imu
+        gravity = (world_from_enu @ [0.0, 0.0, 9.81]) @ rotations
+        for (_, stamp), *measured in zip(each, quaternions.tolist(), rates.tolist(), gravity.tolist(), strict=True):
+            message = self.make.imu(Oriented(stamp, *measured[:2]))
             message.header.frame_id = frame
-            gravity = rotation.T @ (world_from_enu @ np.array([0.0, 0.0, 9.81]))
-            message.linear_acceleration = self.make.vector(gravity)
+            message.linear_acceleration = self.make.vector(measured[2])
             if not orientation:
                 message.orientation_covariance = np.array([-1.0, *[0.0] * 8])
             self.say(stamp, topic, IMU, message)

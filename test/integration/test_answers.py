@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command_line import fail, succeed
 from io_fixtures import run, write_bag
+from report_fixtures import drawn
 from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion, true_mounting
 
 import dvl_calib_ros as dc
@@ -75,7 +76,8 @@ def test_without_an_imu_a_late_reference_in_the_body_is_taken_off_and_no_imu_ask
 
 
 @pytest.mark.slow
-def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
+def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys, monkeypatch):
+    drawn(monkeypatch)  # they are looked at elsewhere
     told = Told()
     told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, math.radians(20.0)))
     vehicle(told)

@@ -39,7 +39,7 @@ def fixed_part() -> list[Case]:
 @pytest.fixture(scope="module")
 def scored(tmp_path_factory):
     """Category -> cases with their answers."""
-    trial = Trial(tmp_path_factory.mktemp("trial"), seed=0, jobs=2)
+    trial = Trial(tmp_path_factory.mktemp("trial"), seed=0, jobs=1)
     answers = trial.run(fixed_part())
     cases = join(unseal(trial.sealed), answers)
     return {category: [case for case in cases if case.truth.category is category] for category in Category}
@@ -97,7 +97,7 @@ def at_sea(tmp_path_factory, snapir_ins):
     cases = [Case(Category.NULL, RECORDED, family=family) for family in (Family.HALF_REAL, Family.HORIZONTAL)]
     cases += [Case(Category.PAIR, RECORDED, family=family) for family in (Family.HALF_REAL, Family.HORIZONTAL)]
     cases += [Case(Category.PAIR, RECORDED, "dvl_time_offset", family=Family.SEVERAL)]
-    trial = Trial(tmp_path_factory.mktemp("at_sea"), seed=0, jobs=2)
+    trial = Trial(tmp_path_factory.mktemp("at_sea"), seed=0, jobs=1)
     answers = trial.run(cases)
     return {(case.truth.family, case.truth.category): case for case in join(unseal(trial.sealed), answers)}
 

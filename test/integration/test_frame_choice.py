@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from remedies import changes
 from scipy.spatial.transform import Rotation
-from situations import DVL, long_motion, sound
+from situations import DVL, five_minutes, sound
 from stacks import LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
 
 from dvl_calib_ros import doctor, replay
@@ -156,7 +156,7 @@ def test_a_reference_in_north_west_up_is_turned_not_the_dvl(tmp_path):
 @pytest.mark.slow
 def test_two_negated_axes_are_a_mounting_or_the_drivers(tmp_path):
     """Of a vehicle that heaves."""
-    told = Told(motion=long_motion())
+    told = Told(motion=five_minutes())
     sound(told)
     for _, topic, _, message in told.rows:
         if topic == DVL:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import fail, succeed
 from io_fixtures import run, storage_file, write_bag
+from report_fixtures import drawn
 
 from dvl_calib_ros.bags import sources
 from dvl_calib_ros.bags.sources import Source
@@ -83,7 +84,10 @@ REGISTERED = {
         "simulate NEW --duration 20 --motion-of BAG",
     ],
 )  # fmt: skip
-def test_a_command_opens_reads_and_registers_each_recording_once(words, bags, passes, registered, tmp_path, capsys):
+def test_a_command_opens_reads_and_registers_each_recording_once(
+    words, bags, passes, registered, tmp_path, capsys, monkeypatch
+):
+    drawn(monkeypatch)  # they are looked at elsewhere
     named = bags | {"REPORT": tmp_path / "report.html", "NEW": tmp_path / "new"}
     command, *arguments = words.split()
     succeed(capsys, command, *(named.get(word, word) for word in arguments))

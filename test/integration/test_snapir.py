@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvl_calib_ros.bag_replay.checked_replay import checked_replay
 from dvl_calib_ros.bag_replay.replay import extrinsics_of_replay, replay
 from dvl_calib_ros.calibration.comparison.mounting_change import compare
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation
+from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
 from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording, read_columns
 from dvl_calib_ros.simulation.sensors import measure_dvl, measure_gnss
@@ -59,37 +58,6 @@ def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, t
             assert estimate.used + estimate.gated == given
 
 
-@pytest.mark.slow
-def test_calibrating_on_t12_corrects_the_other_fourteen_as_published(trajectories, tmp_path, rng):
-    """Set E1 of the protocol, with default parameters: M7 at most 0.066 m/s, M3 and M4 at most 0.045 m/s."""
-    time, velocity = trajectories["T12"]
-    errors_of: dict[str, list[float]] = {name: [] for name in ["uncalibrated", *MODELS]}
-    for number, errors in enumerate(COMBINATIONS):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        result, _ = calibrate_on(folder, time[:200], velocity[:200], errors, rng)
-        residuals: dict[str, list[float]] = {name: [] for name in errors_of}
-        for name in set(TRAJECTORIES) - {"T12"}:
-            truth = trajectories[name][1] @ FLU_FROM_FRD
-            measured = measure_dvl(trajectories[name][1], errors, np.eye(3), rng) @ FLU_FROM_FRD
-            residuals["uncalibrated"].append(vector_rmse(measured - truth))
-            for model, estimate in result.estimates.items():
-                corrected = estimate.corrected_velocity(measured, np.eye(3))
-                residuals[model].append(vector_rmse(corrected - truth))
-        for model, values in residuals.items():
-            errors_of[model].append(float(np.mean(values)))
-    average = {model: float(np.mean(values)) for model, values in errors_of.items()}
-    print("Avg.VRMSE of E1, m/s:", {model: round(value, 4) for model, value in average.items()})
-    assert average["uncalibrated"] == pytest.approx(0.119, abs=0.001)
-    assert average["M7"] <= 0.066
-    assert average["M3"] <= 0.045
-    assert average["M4"] <= 0.045
-
-
-def vector_rmse(error) -> float:
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
-
-
 # Yaw of the vehicle's DVL, deg: what full says with the INS as reference on T01 T03 T05 T13, -0.02 to 0.22.
 YAW_DEG = 0.1
 
@@ -119,36 +87,6 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
     assert np.sqrt(np.mean(error**2)) < 0.38
     assert 0.6 < np.sqrt(np.mean(scaled**2)) < 1.0
     assert selected.count("unaided") >= 9
-
-
-@pytest.mark.spread(1)
-@pytest.mark.parametrize("name", ["T05", "T13"])
-def test_an_ins_that_lags_half_a_second_is_no_filter_of_the_dvl(snapir_ins, tmp_path, name):
-    """T05 shows an arm of 1.6 m, and T13 no angle that could be off: neither has been found to have nothing wrong."""
-    files = (snapir_ins / f"{name}_{kind}.csv" for kind in ("dvl", "gnss", "attitude"))
-    import_recording(*files, tmp_path / name, ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01))
-    result = checked_replay([tmp_path / name], Parameters()).result
-    assert result.verifications[result.selected].verdict.value == "accept"
-
-
-@pytest.mark.slow
-def test_three_recordings_together_are_accepted_with_one_lever_arm_and_a_delay_for_each(snapir_ins, tmp_path):
-    """Their clocks are 0.9 s apart from day to day; one delay for all was rejected."""
-    bags = []
-    for day, name in enumerate(("T01", "T03", "T05")):
-        files = (snapir_ins / f"{name}_{kind}.csv" for kind in ("dvl", "gnss", "attitude"))
-        start = 1_700_000_000.0 + 86_400.0 * day
-        options = ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01, start=start)
-        import_recording(*files, tmp_path / name, options)
-        bags.append(tmp_path / name)
-    replayed = checked_replay(bags, Parameters())
-    result = replayed.result
-    verification = result.verifications["full"]
-    assert result.selected == "full" and verification.verdict.value == "accept"
-    assert verification.held_out.corrected < 0.025
-    assert abs(result.estimate.lever_arm((0.0, 0.0, 0.0))[0] + 1.85) < 0.03
-    found = {day.name: round(day.dvl_time_offset, 2) for day in result.days}
-    assert found == pytest.approx({"T01": -1.43, "T03": -1.49, "T05": -0.52}, abs=0.05)
 
 
 @pytest.mark.slow

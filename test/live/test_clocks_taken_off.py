@@ -26,11 +26,11 @@ ARM, LATE = -0.6, 2.5
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    """Of five minutes, whose reference is stamped late."""
+    """Of 200 s, whose reference is stamped late."""
     path = tmp_path_factory.mktemp("late") / "bag"
     effects = (injection(f"lever_arm:x_m={ARM}"), injection(f"reference_time_offset:seconds={LATE}"))
     errors = DvlErrors((0.01, -0.01, 0.02), (0.003,) * 3, beam_std=0.005)
-    made = Scenario("free", 300.0, 3, errors, gnss_std=0.05, imu_rate=10, effects=effects)
+    made = Scenario("free", 200.0, 3, errors, gnss_std=0.05, imu_rate=10, effects=effects)
     write_bag(made, path, Storage.MCAP, Compression.NONE)
     return path
 

@@ -90,7 +90,7 @@ def test_the_unknown_frame_of_a_reference_is_chosen_by_the_data_as_in_a_replay(w
 def test_a_usbl_with_a_fix_each_five_seconds_is_waited_for_found_and_calibrated_with(world, tmp_path):
     """In its own time until it is found, then once more, fast and to the end."""
     truth = Truth((0.0, 0.01, 0.03), 0.006, (0.5, 0.0, -0.3), 0.5)
-    made = driven(np.random.default_rng(3), 900.0, truth=truth, fix_s=5.0)
+    made = driven(np.random.default_rng(3), 600.0, truth=truth, fix_s=5.0)
     bag = write_positions(tmp_path / "bag", made)
     targets = {"dvl/twist": "/a50/velocity", USBL: "/usbl/pose", "imu/data": "/imu"}
     player, found = BagPlayer(world.node, [bag], targets), threading.Event()

@@ -48,6 +48,12 @@ def contents(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((out / "rows").iterdir())}
 
 
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch) -> None:
+    """But for those of `made`, which are looked at."""
+    drawn(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def dives(tmp_path_factory) -> Path:
     return write_fleet(tmp_path_factory.mktemp("fleet") / "dives")
@@ -347,8 +353,7 @@ def test_an_object_store_gives_what_its_files_give(made, dives, tmp_path, capsys
     assert "memory:///bucket/dives/auv2/no.mcap: " in "".join(one.error.dropna())
 
 
-def test_the_command_prints_the_answer_and_who_needs_a_person(made, dives, tmp_path, monkeypatch, capsys):
-    drawn(monkeypatch)  # they are looked at elsewhere
+def test_the_command_prints_the_answer_and_who_needs_a_person(made, dives, tmp_path, capsys):
     shutil.copytree(made[1], tmp_path / "out")
     said, _ = succeed(capsys, "fleet", dives, "--out", tmp_path / "out", "--jobs", "1")
     assert said.startswith("not compared") or said.startswith("moved")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from command_line import fail, succeed
 from conftest import ROOT
-from report_fixtures import Page
+from report_fixtures import Page, drawn
 
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -133,7 +133,8 @@ def test_the_json_holds_all_of_it_and_the_diagnosis_of_each_side(compared):
 
 
 @pytest.mark.slow
-def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys):
+def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys, monkeypatch):
+    drawn(monkeypatch)  # they are looked at elsewhere
     report, document = tmp_path / "page.html", tmp_path / "answer.json"
     out, _ = succeed(
         capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], "--report", report, "--json", document
