@@ -21,29 +21,34 @@ from validation.stacks import shared_folder
 
 CASES = shared_folder() / "cases"
 # Variants, by the arguments of their scripts; of the others the first. These have no bag or no messages of a DVL.
-VARIANTS = {"dvl_in_earth_axes": ("level enu",), "imu_orientation_wrong": ("zeros",)}
+VARIANTS = {
+    "antenna_on_mast_positions": ("2.2 10",),
+    "driver_signs": ("pmp 0.3",),
+    "dvl_in_earth_axes": ("level enu",),
+    "imu_orientation_wrong": ("zeros",),
+    "ins_odometry_axes": ("ned",),
+    "pd0_alignment": ("declination",),
+}
 # Situations of test_situations.py and test_frame_choice.py, which ask doctor and replay, too
 ELSEWHERE = (
-    "antenna_on_mast_positions", "covariance_not_meant", "driver_signs", "dvl_clock_far", "fixes_before_and_after",
-    "moving_bed", "pd0_alignment", "reference_fused_from_dvl", "stack_z_down", "tank_with_mocap",
-    "wrong_transform_without_reference", "yaw_sign_135", "z_flipped",
+    "covariance_not_meant", "dvl_clock_far", "fixes_before_and_after", "moving_bed", "reference_fused_from_dvl",
+    "stack_z_down", "tank_with_mocap", "wrong_transform_without_reference", "yaw_sign_135", "z_flipped",
 )  # fmt: skip
-# Verdicts and reasons of doctor and replay are those of another case: of g3_02, fix_ddmm, control, velocity_turned_90
-ALIKE = "beam_6_percent", "beams_rotated", "gnss_up_bias", "ins_odometry_axes"
 # First cause of a rejection, '' for a usable recording.
-CAUSES = {"fix_ddmm": "DOCTOR_UNITS", "velocity_turned_90": "", "z_half": "DVL_AXIS_SCALED"}
+CAUSES = {
+    "antenna_on_mast_positions 2.2 10": "", "fix_ddmm": "DOCTOR_UNITS",
+    "pd0_alignment declination": "MOUNTING_CONTRADICTED", "velocity_turned_90": "", "z_half": "DVL_AXIS_SCALED",
+}  # fmt: skip
 NO_DVL = "ros1_recordings", "simulated_time", "team_dvl_types"
 SCRIPTS = [*sorted(CASES.glob("axes/*.py")), *sorted(CASES.glob("public/*.py"))]
 SHARED = [
     (each, words)
     for each in SCRIPTS
-    if each.stem not in (*NO_DVL, *ELSEWHERE, *ALIKE)
+    if each.stem not in (*NO_DVL, *ELSEWHERE)
     for words in VARIANTS.get(each.stem, ("",))
 ]
 GAPS = sorted(CASES.glob("gap/*/a"))
-# The first traps of three files are answered as the one of control is
-NO_TRAPS = "helpers", "judge", "phys", "frames", "more", "sensors"
-TRAPS = sorted(each for each in CASES.glob("traps/*.py") if each.stem not in NO_TRAPS)
+TRAPS = sorted(each for each in CASES.glob("traps/*.py") if each.stem not in ("helpers", "judge", "phys"))
 BAGS = ".mcap", ".db3", ".bag"
 # A diagnosis that names an effect; the real one takes minutes, and what it begins with is the calibration's.
 NAMED = Diagnosis(DiagnosisVerdict.AMBIGUOUS, (), None, (), (), (), {}, {}, (), ())
