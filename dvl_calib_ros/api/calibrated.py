@@ -337,10 +337,11 @@ class Calibration:
         InputError
             If it cannot be written.
         """
-        from ..present.page import write_replay_report
+        from ..present.page import write_report
+        from ..present.replay import replayed
 
         target = Path(path)
-        write_replay_report(target, self.replayed, self.bags, list(MODELS))
+        write_report(target, replayed(self.replayed, self.bags, list(MODELS)))
         return target
 
     def document(self, models: Sequence[str] = tuple(MODELS)) -> dict[str, Any]:

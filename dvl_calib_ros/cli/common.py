@@ -7,10 +7,11 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from ..errors import InputError, needing_ros, printable
+from ..errors import InputError, needing_page, needing_ros, printable
 from ..standard_streams import give_up
 from . import profile
 
@@ -153,6 +154,8 @@ def check_outputs(
 ) -> None:
     """Raise InputError before work is done if an output cannot be written or is also an input.
 
+    Also without the libraries that --report needs.
+
     files, folders: options that name outputs. All other paths in the arguments and the parameters are inputs.
     also_read: further inputs. also_written: further outputs, by their names in errors.
     """
@@ -177,6 +180,9 @@ def check_outputs(
             check_folder_writable(given[name])
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
     check_apart(as_options[0] | dict(also_written or {}), read, as_options[1])
+    if "report" in given:
+        with needing_page("--report"):
+            from ..present import page  # noqa: F401
 
 
 def console(stderr: bool = False) -> Console:
@@ -316,21 +322,19 @@ def add_report_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report to look at (HTML, one file)")
 
 
-def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> Callable[..., None]:
-    """Return a function of present/page.py, which must not be called without --report.
+def write_page(path: Path, result: object) -> None:
+    """Write a result's report, as `page.write_report`."""
+    from ..present.page import write_report
 
-    Raises InputError, before any work is done, if a library for reports is missing.
-    """
-    if arguments.report is None:
-        return _no_report
-
-    try:
-        from ..present import page
-    except ModuleNotFoundError as error:
-        raise InputError(f"--report needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2") from error
-    write: Callable[..., None] = getattr(page, name)
-    return write
+    write_report(path, result)
 
 
-def _no_report(*_: object) -> None:
-    raise AssertionError("--report was not given")
+def result_files(arguments: argparse.Namespace, result: Any) -> list[tuple[Path | None, Callable[[Path], object]]]:
+    """Return --json and --report with the functions that write a result, for `deliver`."""
+
+    def write_plain_data(path: Path) -> None:
+        from ..present.result_documents import PLAIN_DATA
+
+        write_json(path, PLAIN_DATA[type(result)](result))
+
+    return [(arguments.json, write_plain_data), (arguments.report, partial(write_page, result=result))]

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, needing_ros
 from . import common
-from .common import add_report_option, report_writer
 from .watch import node_command
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ SCALE_PERCENT = 0.5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("--speed", type=float, default=20.0, help="times real time; default: %(default)g")
-    add_report_option(parser)
+    common.add_report_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,12 +42,12 @@ def run(arguments: argparse.Namespace) -> int:
     Return 0 if both agree, else 1.
     """
     from ..calibration.models import MODELS
+    from ..present.replay import replayed
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
     bag = common.share_folder() / "bags" / BAG
     common.check_outputs(arguments, "report", also_read=[bag])
-    write_report = report_writer(arguments, "write_replay_report")
     os.environ.update(private_domain())
     with needing_ros("demo"):
         import rclpy
@@ -74,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         agree = _compare(out, saved, offline.result)
     _show_diagnosis(out, bag)
     if arguments.report is not None:
-        write_report(arguments.report, offline, [bag], list(MODELS))
+        common.write_page(arguments.report, replayed(offline, [bag], list(MODELS)))
         out.print(f"The replay's report is in {arguments.report}.")
     return 0 if agree else 1
 
