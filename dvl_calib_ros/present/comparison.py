@@ -29,6 +29,11 @@ class ComparedQuantity(NamedTuple):
     factor: float
     changes: str
 
+    def with_std(self, compared: Extrinsics | Difference, signed: bool = False) -> str:
+        """Return its value with σ in a calibration or a difference."""
+        at = self.component
+        return with_std(self.factor * compared.value[at], self.factor * compared.std[at], signed=signed)
+
 
 QUANTITIES = (
     ComparedQuantity(0, "roll", "°", _DEGREE, "moved"),
@@ -56,9 +61,7 @@ def comparison(result: Comparison) -> Document:
         "samples": lambda each: str(each.used),
         **columns_for(
             {f"{each.name}, {each.unit}": each for each in shown_quantities(result)},
-            lambda each, quantity: with_std(
-                quantity.factor * each.value[quantity.component], quantity.factor * each.std[quantity.component]
-            ),
+            lambda each, quantity: quantity.with_std(each),
         ),
     }
     own_values = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
@@ -109,11 +112,7 @@ def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Tab
         "": lambda each: each[0],
         **columns_for(
             {f"{each.name}, {each.unit}": each for each in quantities},
-            lambda each, quantity: with_std(
-                quantity.factor * each[1].value[quantity.component],
-                quantity.factor * each[1].std[quantity.component],
-                signed=True,
-            ),
+            lambda each, quantity: quantity.with_std(each[1], signed=True),
         ),
         "mounting: p": lambda each: f"{each[2]:.{'2f' if each[2] >= 0.01 else '0e'}}",
     }

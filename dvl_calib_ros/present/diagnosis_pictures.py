@@ -16,7 +16,7 @@ from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin, RegressorPlot
 from .diagnosis import twin_errors
 from .figure_data import CUT_FROM_S, TimeAxis, running_mean
-from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
+from .figure_style import FAINT, INK, Picture, legend_above, log_scale, new_figure, picture, rows_figure
 from .numbers import mm
 from .replay_figures import AFTER, BAD
 
@@ -67,11 +67,8 @@ def spectra(frequency: Array, series: Mapping[str, Array], label: str) -> Figure
     figure, axes = new_figure()
     for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
         axes.plot(frequency, MM * values, color=colour, linewidth=width, label=name)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
     axes.set_ylim(*_decade_limits(MM * np.concatenate(list(series.values()))))
-    plain_log_ticks(axes.xaxis)
-    plain_log_ticks(axes.yaxis)
+    log_scale(axes, "xy")
     axes.set_xlabel("frequency, Hz")
     axes.set_ylabel(label)
     legend_above(axes)
@@ -85,33 +82,22 @@ def _decade_limits(values: Array) -> tuple[float, float]:
     return low / widen, high * widen
 
 
-def gap_bars(names: Sequence[str], gaps: Mapping[str, Array]) -> Figure:
-    """Draw the gap in each regime of motion, by name (R, 3): value and 95 per cent interval, m/s."""
-    return _bars(names, gaps, "gap beyond the noise, mm/s rms (95 %)")
+def regime_bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: float | None = None) -> Figure:
+    """Draw bars for each regime of motion, by name (R, 1) or with a 95 per cent interval (R, 3), m/s.
 
-
-def error_bars(names: Sequence[str], errors: Mapping[str, Array], noise: float) -> Figure:
-    """Draw the error in each regime of motion (R, 1) m/s rms, by name, and the common noise."""
-    return _bars(names, errors, "recorded − twin, mm/s rms", noise)
-
-
-def _bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: float | None = None) -> Figure:
-    """Draw bars for each regime, by name (R, 1) or with an interval (R, 3), m/s. noise: a line across all."""
-    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    noise: m/s, a line across all.
+    """
+    figure, axes, places = rows_figure(names, label, pad=0.5)
     height = 0.8 / len(groups)
     for i, ((name, values), (colour, _)) in enumerate(zip(groups.items(), _line_styles(list(groups)), strict=True)):
-        rows = np.arange(len(names)) + (i - 0.5 * (len(groups) - 1)) * height
+        rows = places + (i - 0.5 * (len(groups) - 1)) * height
         value, *interval = MM * values.T
         axes.barh(rows, value, height=0.9 * height, color=colour, alpha=0.85, label=name)
         if interval:
             axes.hlines(rows, *interval, color=INK, linewidth=1.0)
     if noise is not None:
         axes.axvline(MM * noise, color=INK, linewidth=1.0, linestyle=":", label="noise")
-    axes.set_yticks(range(len(names)), names)
-    axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel(label)
-    axes.grid(False, axis="y")
     legend_above(axes)
     return figure
 
@@ -187,17 +173,12 @@ def closure_bars(names: Sequence[str], closures: Array, together: tuple[float, f
     labels = [*names, "together"] if len(names) > 1 else list(names)
     values = [*closures, together[0]] if len(names) > 1 else [together[0]]
     colours = [FAINT] * len(names) + [AFTER] if len(names) > 1 else [AFTER]
-    figure, axes = new_figure(height=1.1 + 0.36 * len(labels))
-    rows = np.arange(len(labels))
+    figure, axes, rows = rows_figure(labels, "share of the gap closed on held-out data, %", height=1.1)
     axes.barh(rows, 100.0 * np.asarray(values), color=colours, height=0.6)
     axes.hlines(rows[-1], 100.0 * together[1], 100.0 * together[2], color=INK, linewidth=1.4)
     axes.axvline(100.0, color=INK, linewidth=0.7, linestyle=":")
-    axes.set_yticks(rows, labels)
-    axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_xlim(min(0.0, 100.0 * float(np.min([*values, together[1]]))), 105.0)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
-    axes.set_xlabel("share of the gap closed on held-out data, %")
-    axes.grid(False, axis="y")
     return figure
 
 
@@ -256,7 +237,7 @@ def regime_picture(series: DiagnosisSeries, with_effects: bool) -> Picture:
         for i, regime in enumerate(names)
     )
     return picture(
-        "Gap by regime of motion", alt, gap_bars, names, gaps,
+        "Gap by regime of motion", alt, regime_bars, names, gaps, "gap beyond the noise, mm/s rms (95 %)",
         caption="Held out."
         + (" Slow and fast: the lowest and the highest third of the speeds." if "slow" in series.regimes else ""),
     )  # fmt: skip
@@ -346,7 +327,10 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
         f"{each.regime}: " + ", ".join(f"{name} {mm(error)} mm/s" for name, error in each.errors.items())
         for each in parts
     )
-    yield picture(f"{twin.name}: error by regime", alt, error_bars, [each.regime for each in parts], errors, twin.level)
+    yield picture(
+        f"{twin.name}: error by regime", alt,
+        regime_bars, [each.regime for each in parts], errors, "recorded − twin, mm/s rms", twin.level,
+    )  # fmt: skip
 
 
 def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:

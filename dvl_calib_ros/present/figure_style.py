@@ -15,10 +15,12 @@ from itertools import cycle, islice
 from typing import Any, NamedTuple
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
 
 from ..calibration.models import MODELS
 from .figure_data import explorable
@@ -122,6 +124,23 @@ def new_figure(height: float = HEIGHT) -> tuple[Figure, Axes]:
     return figure, figure.add_subplot()
 
 
+def rows_figure(
+    names: Sequence[str], label: str, height: float = 1.2, per_row: float = 0.36, pad: float = 0.6, grid: bool = False
+) -> tuple[Figure, Axes, NDArray[np.intp]]:
+    """Return a figure with a named row for each value, from the top, and the rows' places (N,).
+
+    label: of the values. height, per_row: inches without rows, and of each. pad: rows of space at both ends. grid:
+    whether rows have lines.
+    """
+    figure, axes = new_figure(height + per_row * len(names))
+    rows = np.arange(len(names))
+    axes.set_yticks(rows, names)
+    axes.set_ylim(len(names) - (1.0 - pad), -pad)
+    axes.set_xlabel(label)
+    axes.grid(grid, axis="y")
+    return figure, axes, rows
+
+
 def line_widths(models: Sequence[str], selected: str = "") -> list[float]:
     """Return line widths: the selected model's is the widest, later ones are thinner.
 
@@ -138,7 +157,14 @@ def legend_above(axes: Axes, columns: int = 3, markerscale: float = 1.0) -> None
     )  # fmt: skip
 
 
-def plain_log_ticks(axis: Axis) -> None:
+def log_scale(axes: Axes, names: str) -> None:
+    """Make axes logarithmic, such as ``xy``, with plain numbers at the ticks."""
+    for name in names:
+        getattr(axes, f"set_{name}scale")("log")
+        _plain_log_ticks(getattr(axes, f"{name}axis"))
+
+
+def _plain_log_ticks(axis: Axis) -> None:
     """Format the ticks of a logarithmic axis as plain numbers."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))

@@ -35,9 +35,10 @@ from .figure_style import (
     Picture,
     legend_above,
     line_widths,
+    log_scale,
     new_figure,
     picture,
-    plain_log_ticks,
+    rows_figure,
 )
 
 GOOD, WARNING, BAD, AFTER = "#2a7f62", "#e0a030", "#c0392b", "#1f6fb2"
@@ -161,8 +162,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
             where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=name
         )
     axes.axhline(1.0, color=INK, linewidth=0.8)
-    axes.set_yscale("log")
-    plain_log_ticks(axes.yaxis)
+    log_scale(axes, "y")
     axes.set_ylabel("NIS per measured component")
     time.label_time(axes)
     return figure
@@ -187,17 +187,14 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
 
 def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
     """Draw velocity errors on held-out data (N,), m/s rms. Points, because each includes the reference's noise."""
-    figure, axes = new_figure(height=1.2 + 0.27 * len(labels))
-    rows = np.arange(len(labels))
+    label = "velocity error on held-out data, m/s rms"
+    figure, axes, rows = rows_figure(labels, label, per_row=0.27, pad=0.5, grid=True)
     axes.hlines(rows, corrected, uncorrected, color=FAINT, linewidth=1.6)
     axes.plot(uncorrected, rows, "|", color=BAD, markersize=11.0, markeredgewidth=2.2, label="uncorrected")
     axes.plot(corrected, rows, "o", color=AFTER, markersize=6.0, label="corrected")
     axes.plot(
         predicted, rows, "D", color=INK, markersize=5.0, markerfacecolor="none", markeredgewidth=1.1, label="predicted"
     )
-    axes.set_yticks(rows, labels)
-    axes.set_ylim(len(labels) - 0.5, -0.5)
-    axes.set_xlabel("velocity error on held-out data, m/s rms")
     legend_above(axes)
     return figure
 

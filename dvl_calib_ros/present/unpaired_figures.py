@@ -13,7 +13,7 @@ from ..calibration.numerics.frames import Array
 from ..unpaired.gap_ladder import ALL, AS_IT_IS, NOISE, Shrunk
 from ..unpaired.results import UnpairedComparison
 from .figure_data import running_mean
-from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
+from .figure_style import FAINT, INK, Picture, legend_above, log_scale, new_figure, picture, rows_figure
 from .replay_figures import AFTER, BAD
 
 DVL_AXES = ("x", "y", "z")
@@ -47,29 +47,20 @@ def shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
 
 def error_bars(names: Sequence[str], errors: Sequence[float], floor: float) -> Figure:
     """Draw the error of each model, mm/s, and the noise."""
-    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    figure, axes, rows = rows_figure(names, "recorded less simulated, held out, mm/s rms")
     colours = [BAD] + [FAINT] * (len(names) - 2) + [AFTER] if len(names) > 1 else [BAD]
-    axes.barh(range(len(names)), errors, color=colours, height=0.6)
+    axes.barh(rows, errors, color=colours, height=0.6)
     axes.axvline(floor, color=INK, linewidth=0.9, linestyle=":", label="noise")
-    axes.set_yticks(range(len(names)), names)
-    axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.set_xlabel("recorded less simulated, held out, mm/s rms")
-    axes.grid(False, axis="y")
     legend_above(axes)
     return figure
 
 
 def distance_bars(names: Sequence[str], distances: Sequence[float], null95: Sequence[float]) -> Figure:
     """Draw the energy distance of each model, and its 95 % quantile if both sides are alike."""
-    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
-    rows = np.arange(len(names))
+    figure, axes, rows = rows_figure(names, "energy distance")
     indistinguishable = [d <= n for d, n in zip(distances, null95, strict=True)]
     axes.barh(rows, distances, color=[AFTER if each else BAD for each in indistinguishable], height=0.6)
     axes.vlines(null95, rows - 0.38, rows + 0.38, color=INK, linewidth=1.6)
-    axes.set_yticks(rows, names)
-    axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.set_xlabel("energy distance")
-    axes.grid(False, axis="y")
     return figure
 
 
@@ -112,15 +103,10 @@ def noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
 
 def level_bars(levels: Mapping[str, tuple[float, float]]) -> Figure:
     """Draw the noise of both sides in each regime, m/s."""
-    figure, axes = new_figure(height=1.2 + 0.36 * len(levels))
-    rows = np.arange(len(levels))
+    figure, axes, rows = rows_figure(list(levels), "noise over the axes, mm/s")
     for i, (side, colour) in enumerate((("vehicle", INK), ("simulator", AFTER))):
         values = [MM * each[i] for each in levels.values()]
         axes.barh(rows + (i - 0.5) * 0.38, values, height=0.34, color=colour, label=side)
-    axes.set_yticks(rows, list(levels))
-    axes.set_ylim(len(levels) - 0.4, -0.6)
-    axes.set_xlabel("noise over the axes, mm/s")
-    axes.grid(False, axis="y")
     legend_above(axes)
     return figure
 
@@ -136,10 +122,7 @@ def spectra(lines: Mapping[str, tuple[Array, Array]]) -> Figure:
     figure, axes = new_figure()
     for (side, (frequency, density)), colour in zip(lines.items(), (INK, AFTER), strict=True):
         axes.plot(frequency, MM * np.maximum(density, 1e-7), color=colour, label=side)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    plain_log_ticks(axes.xaxis)
-    plain_log_ticks(axes.yaxis)
+    log_scale(axes, "xy")
     axes.set_xlabel("frequency, Hz")
     axes.set_ylabel("mm/s/√Hz")
     legend_above(axes)
