@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from ..errors import InputError, needing_page, needing_ros, printable
+from ..recordings.topics import Topics
 from ..standard_streams import give_up
 from . import profile
 
@@ -46,14 +47,14 @@ def _parameter_completions(**_: Any) -> list[str]:
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:
     """Add --dvl-topic, --gnss-topic and --imu-topic of the node."""
-    for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
+    for role, default in vars(Topics()).items():
         parser.add_argument(f"--{role}-topic", default=default, metavar="TOPIC", help=f"default: {default}")
 
 
 def add_discovery_options(parser: argparse.ArgumentParser) -> None:
     """Add the parameters, and the topics of recordings, whose defaults are found by type and content."""
     add_parameter_options(parser)
-    for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
+    for role, default in vars(Topics()).items():
         none = "" if role == "dvl" else "; none: do without"
         help_ = f"default: {default}, else found by type and content{none}"
         parser.add_argument(f"--{role}-topic", metavar="TOPIC", help=help_)

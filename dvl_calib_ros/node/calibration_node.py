@@ -33,11 +33,11 @@ from ..calibration.numerics.samples import DvlSample, VelocityFrame
 from ..calibration.results.results import Correction, lever_arm, mounting_pose
 from ..calibration.streams.position_velocities import check_model
 from ..discovery.gravity import believed_heading
-from ..discovery.transforms import Frames, not_default, placement
+from ..discovery.transforms import Frames, placement
 from ..disk.atomic import check_writable
 from ..errors import InputError
 from ..files.output_paths import check_outputs
-from ..files.parameter_files import NODE_NAME
+from ..files.parameter_files import NODE_NAME, changed_parameters
 from ..files.result_file import (
     KeptError,
     check_in_folder,
@@ -99,7 +99,7 @@ class CalibrationNode(AnsweringNode):
         # a saved calibration belongs to the mounting that it was saved with
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
-        self._given = not_default(parameters)
+        self._given = frozenset(changed_parameters(parameters))
         self._awaits_heading_std = "heading_deviation_std" not in self._given
         self._late_clocks, self._gravity = LateClocks(named), GravitySeen()
         # used for every DVL message, and constant at run time
@@ -179,16 +179,16 @@ class CalibrationNode(AnsweringNode):
             searching.close()
             return
         try:
-            found = searching.step(self._named_topics(has_dvl=has_dvl))
+            discovery = searching.step(self._named_topics(has_dvl=has_dvl))
         except InputError as error:
             self.warn(f"{error}; topics are not searched")
             searching.close()
             self._discovering = None
             return
-        if found is None:
+        if discovery is None:
             return
         self._discovering = None
-        discovery, parameters = found
+        parameters = discovery.parameters
         self._found = [] if has_dvl else [finding("TOPICS_FOUND", own=dvl, found=discovery.found[0])]
         for sentence in discovery.found[1:]:
             self.info(sentence)
@@ -269,10 +269,9 @@ class CalibrationNode(AnsweringNode):
 
     def _log_configuration(self) -> None:
         """Log the model and all parameters that differ from their defaults."""
-        default = Parameters().as_dict()
-        given = self._calibrator.parameters.as_dict()
-        changed = ", ".join(f"{name}: {value}" for name, value in given.items() if value != default[name])
-        self.info(f"model {given['model']}; parameters not at their default: {changed or 'none'}")
+        parameters = self._calibrator.parameters
+        changed = ", ".join(f"{name}: {value}" for name, value in changed_parameters(parameters).items())
+        self.info(f"model {parameters.model}; parameters not at their default: {changed or 'none'}")
 
     # ------------------------------------------------------------------ input
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from ..errors import InputError
 from ..messages.decode import stamp_ns
 from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES
 from ..messages.encode import FRAME_IDS
+from ..recordings.topics import Topics
 from ..simulation.live_simulation import Follower, MotionSample, Sample, in_order, shifted
 from ..simulation.scenario import START_NS, Scenario, simulate
 from .message_types import fill, message_class, set_stamp
@@ -44,13 +45,10 @@ BREATH_S = 0.05
 
 
 @dataclass(frozen=True)
-class Outputs:
+class Outputs(Topics):
     """Topics, and the DVL's message type (a name of `messages.drivers`). Raises InputError for an unknown type."""
 
-    dvl: str = "dvl/twist"
-    gnss: str = "gnss/twist"
-    imu: str = "imu/data"
-    dvl_type: str = field(default=TWIST_TYPE)
+    dvl_type: str = TWIST_TYPE
 
     def __post_init__(self) -> None:
         if self.dvl_type not in TYPES_OF["dvl_type"]:
