@@ -291,10 +291,9 @@ def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
     with Ending() as ending:
         with needing_ros(what):
             import rclpy
-            from rclpy.signals import SignalHandlerOptions
 
-            from ..node.services import AnsweringNode
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+            from ..node.services import AnsweringNode, init_ros
+        init_ros([])
         node = AnsweringNode(name)
         try:
             yield node, ending

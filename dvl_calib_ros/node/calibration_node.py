@@ -16,9 +16,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -59,7 +59,7 @@ from .message_queue import Arrived, in_order_of_arrival, take
 from .message_types import empty_twist, fill_errors, set_stamp, velocity_class
 from .operator_card import Card
 from .ros_parameters import declare_parameters
-from .services import AnsweringNode
+from .services import LATCHED, AnsweringNode
 from .status import status_name
 from .topic_graph import input_problems, output_problems, twin_problems
 from .transforms import MountingOutput, Transforms
@@ -113,15 +113,9 @@ class CalibrationNode(AnsweringNode):
         self._estimate = empty_twist()
         self._corrected = empty_twist()
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
-        latched = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST,
-            depth=1,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
-        self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
-        self._iac_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", latched)
-        self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", latched)
+        self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", LATCHED)
+        self._iac_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", LATCHED)
+        self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", LATCHED)
         self._mounting = MountingOutput(self, self._mounting_publisher, parameters.publish_tf, self.warn)
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
@@ -278,32 +272,17 @@ class CalibrationNode(AnsweringNode):
     def _subscribe(
         self, message_type: type, topic: str, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE
     ) -> None:
-        """Subscribe reliably, and change to best effort if a best-effort publisher appears.
-
-        A reliable subscription loses nothing but receives nothing from a best-effort publisher; best effort receives
-        from both.
-        """
-
-        def on_incompatible(event: Any) -> None:
-            if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
-                self.info(f"{topic}: a publisher is best effort; subscribing as best effort")
-                assert self.executor is not None  # it runs this callback
-                self.executor.create_task(resubscribe)
+        """Subscribe reliably, and change to best effort if a best-effort publisher appears."""
 
         def resubscribe() -> None:
+            self.info(f"{topic}: a publisher is best effort; subscribing as best effort")
             old = self._inputs[topic]
             self.deliver()  # messages waiting in the old subscription would be lost
             self._subscribe(message_type, topic, ReliabilityPolicy.BEST_EFFORT)
             self.destroy_subscription(old)
 
-        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
-        self._inputs[topic] = self.create_subscription(
-            message_type,
-            self._found_names.get(topic, topic),
-            partial(self._on_message, topic),
-            profile,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False),
-        )
+        name, on_message = self._found_names.get(topic, topic), partial(self._on_message, topic)
+        self._inputs[topic] = self.subscribe(message_type, name, on_message, QUEUE, resubscribe, reliability)
 
     def _on_message(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
         self._deliver({topic: Arrived.of(message, info)})

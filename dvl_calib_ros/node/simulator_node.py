@@ -16,10 +16,8 @@ import rclpy
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from ..calibration.numerics.frames import rotation_from_quaternion
@@ -33,7 +31,7 @@ from ..recordings.topics import Topics
 from ..simulation.live_simulation import Follower, MotionSample, Sample, in_order, shifted
 from ..simulation.scenario import START_NS, Scenario, simulate
 from .message_types import fill, message_class, set_stamp
-from .services import AnsweringNode
+from .services import AnsweringNode, init_ros
 from .shutdown import Ending
 
 NODE_NAME = "dvl_simulator"
@@ -102,18 +100,11 @@ class SimulatorNode(AnsweringNode):
     def _subscribe(self, topic: str, reliability: ReliabilityPolicy) -> None:
         """Subscribe reliably, and change to best effort if a best-effort publisher appears."""
 
-        def on_incompatible(event: Any) -> None:
-            if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
-                assert self.executor is not None  # it runs this callback
-                self.executor.create_task(resubscribe)
-
         def resubscribe() -> None:
             self.destroy_subscription(subscription)
             self._subscribe(topic, ReliabilityPolicy.BEST_EFFORT)
 
-        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
-        events = SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False)
-        subscription = self.create_subscription(Odometry, topic, self._on_odometry, profile, event_callbacks=events)
+        subscription = self.subscribe(Odometry, topic, self._on_odometry, QUEUE, resubscribe, reliability)
 
     def _on_odometry(self, message: Any) -> None:
         """Publish the samples that a new odometry message makes computable; restart if its time goes back."""
@@ -147,10 +138,7 @@ def run_until(
     """
     run = simulate(scenario) if follow is None else None
     samples: list[Sample] = [] if run is None else in_order(run)
-    try:
-        rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rclpy raises its own types for bad --ros-args
-        raise InputError(" ".join(str(error).split())) from error
+    init_ros([NODE_NAME, *ros_args])
     node = None
     try:
         node = SimulatorNode(outputs, max(QUEUE, len(samples)))
