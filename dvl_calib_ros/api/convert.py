@@ -15,7 +15,7 @@ from .arguments import Bags, StrPath, as_path, as_paths, storage_and_compression
 from .calibrated import Calibration
 
 if TYPE_CHECKING:
-    from ..bags.recover import Recovered
+    from ..bags.writer import Recovered
     from ..evaluation.cross_check import CrossCheck
     from ..evaluation.results import Evaluation
     from ..files.mounting import Applied
@@ -47,7 +47,7 @@ def salvage(bags: Bags, output: StrPath, *, storage: str = "mcap", compression: 
     InputError
         For a path that is no bag or holds no message, and if the new bag cannot be written.
     """
-    from ..bags.recover import recover
+    from ..bags.writer import recover
 
     return recover(as_paths(bags), Path(output), *storage_and_compression(storage, compression))
 

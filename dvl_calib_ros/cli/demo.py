@@ -131,7 +131,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     from ..disk.text_files import load_yaml
     from ..files.result_file import load_result
     from ..present.document import Table
-    from ..present.error_terms import estimate_table
+    from ..present.replay import estimate_table
     from ..present.terminal import rich_table
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`")

@@ -15,8 +15,19 @@ from ..calibration.numerics.distributions import normal_isf, normal_sf
 from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin, RegressorPlot
 from .diagnosis import twin_errors
-from .figure_data import CUT_FROM_S, TimeAxis, running_mean
-from .figure_style import FAINT, INK, Picture, legend_above, log_scale, new_figure, picture, rows_figure
+from .figure_style import (
+    CUT_FROM_S,
+    FAINT,
+    INK,
+    Picture,
+    TimeAxis,
+    legend_above,
+    log_scale,
+    new_figure,
+    picture,
+    rows_figure,
+    running_mean,
+)
 from .numbers import mm
 from .replay_figures import AFTER, BAD
 

@@ -24,22 +24,25 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array, rotation_from_rpy, rotation_of, turn_between
 from ..calibration.results.mounting_quantities import quantities
 from ..calibration.results.results import Result, corrected_rpy, rpy_std
-from .error_terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
-from .figure_data import MapTrack, TimeAxis, running_mean, thin
 from .figure_style import (
     FAINT,
     INK,
     MODEL_STYLES,
     REFERENCE_COLOUR,
     WIDTH,
+    MapTrack,
     Picture,
+    TimeAxis,
     legend_above,
     line_widths,
     log_scale,
     new_figure,
     picture,
     rows_figure,
+    running_mean,
+    thin,
 )
+from .replay import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
 
 GOOD, WARNING, BAD, AFTER = "#2a7f62", "#e0a030", "#c0392b", "#1f6fb2"
 

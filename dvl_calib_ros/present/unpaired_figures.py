@@ -12,8 +12,7 @@ from scipy.signal import welch
 from ..calibration.numerics.frames import Array
 from ..unpaired.gap_ladder import ALL, AS_IT_IS, NOISE, Shrunk
 from ..unpaired.results import UnpairedComparison
-from .figure_data import running_mean
-from .figure_style import FAINT, INK, Picture, legend_above, log_scale, new_figure, picture, rows_figure
+from .figure_style import FAINT, INK, Picture, legend_above, log_scale, new_figure, picture, rows_figure, running_mean
 from .replay_figures import AFTER, BAD
 
 DVL_AXES = ("x", "y", "z")

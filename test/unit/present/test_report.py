@@ -24,8 +24,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.files.urdf import numbers
-from dvl_calib_ros.present.figure_data import MapTrack, TimeAxis, explorable
-from dvl_calib_ros.present.figure_style import MODEL_STYLES, new_figure
+from dvl_calib_ros.present.figure_style import MODEL_STYLES, MapTrack, TimeAxis, explorable, new_figure
 from dvl_calib_ros.present.page import plain, write_report
 from dvl_calib_ros.present.replay import replayed as document_of
 from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, held_out_errors
