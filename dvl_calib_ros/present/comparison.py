@@ -29,10 +29,9 @@ class ComparedQuantity(NamedTuple):
     factor: float
     changes: str
 
-    def with_std(self, compared: Extrinsics | Difference, signed: bool = False) -> str:
-        """Return its value with σ in a calibration or a difference."""
-        at = self.component
-        return with_std(self.factor * compared.value[at], self.factor * compared.std[at], signed=signed)
+    def of(self, compared: Extrinsics | Difference) -> tuple[float, float]:
+        """Return its value and σ in a calibration or a difference, in its unit."""
+        return self.factor * compared.value[self.component], self.factor * compared.std[self.component]
 
 
 QUANTITIES = (
@@ -61,7 +60,7 @@ def comparison(result: Comparison) -> Document:
         "samples": lambda each: str(each.used),
         **columns_for(
             {f"{each.name}, {each.unit}": each for each in shown_quantities(result)},
-            lambda each, quantity: quantity.with_std(each),
+            lambda each, quantity: with_std(*quantity.of(each)),
         ),
     }
     own_values = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
@@ -112,7 +111,7 @@ def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Tab
         "": lambda each: each[0],
         **columns_for(
             {f"{each.name}, {each.unit}": each for each in quantities},
-            lambda each, quantity: quantity.with_std(each[1], signed=True),
+            lambda each, quantity: with_std(*quantity.of(each[1]), signed=True),
         ),
         "mounting: p": lambda each: f"{each[2]:.{'2f' if each[2] >= 0.01 else '0e'}}",
     }

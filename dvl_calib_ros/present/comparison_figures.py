@@ -30,10 +30,9 @@ def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONEN
     """Draw every quantity observable in two calibrations, one picture each. components: restrict to these."""
     pictures = []
     for quantity in (each for each in shown_quantities(comparison) if each.component in components):
-        at = quantity.component
-        known = [each for each in comparison.calibrations if each.shown[at]]
+        known = [each for each in comparison.calibrations if each.shown[quantity.component]]
         values_text = ", ".join(
-            f"{each.name} {quantity.factor * each.value[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
+            "{} {:+.2f} ± {:.2f}".format(each.name, *quantity.of(each))
             for each in (known if len(known) <= MOST_LISTED else (known[0], known[-1]))
         )
         values_text += f", and {len(known) - 2} between them" if len(known) > MOST_LISTED else ""
@@ -70,8 +69,7 @@ def _draw_quantity(axes: Axes, comparison: Comparison, quantity: ComparedQuantit
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
     dated = _dated(comparison.calibrations)
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
-    value = quantity.factor * np.array([each.value[quantity.component] for each in known])
-    std = quantity.factor * np.array([each.std[quantity.component] for each in known])
+    value, std = np.array([quantity.of(each) for each in known]).T
     at = [_middle_day(each) if dated else float(order[id(each)]) for each in known]
     axes.errorbar(at, value, std, fmt="o", color=_POINT, markersize=4.0, capsize=2.5, elinewidth=1.2)
     changes: Sequence[Change] = getattr(comparison, quantity.changes)

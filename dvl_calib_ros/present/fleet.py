@@ -189,7 +189,7 @@ VEHICLES: Columns[VehicleNow] = {
     "seen from, °": lambda each: each.detectable_movement,
     **columns_for(
         {f"{each.name}, {each.unit}": each for each in _ANGLES_AND_SCALE},
-        lambda each, quantity: "–" if each.mounting is None else quantity.with_std(each.mounting),
+        lambda each, quantity: "–" if each.mounting is None else with_std(*quantity.of(each.mounting)),
     ),
 }
 SEVERAL_NOTE = "With several recordings the sentence is about the first."
