@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ..calibration.comparison.mounting_change import ANSWERS
 from ..calibration.models.parameters import Parameters
 from ..discovery.discovery import Given
 from ..disk.atomic import check_folder_writable, save_bytes
@@ -213,10 +214,6 @@ def _arrow() -> Any:
     return pyarrow
 
 
-# answers of a comparison, the worst first
-WORDS = ("moved", "suspicious", "same")
-
-
 @dataclass(frozen=True, repr=False)
 class Fleet(Answering):
     """Content of a catalogue after a run.
@@ -259,7 +256,7 @@ class Fleet(Answering):
     def word(self) -> str:
         """The answer: whether any mounting moved."""
         words = [each.compared.word for each in self.vehicles if each.compared is not None]
-        return next((word for word in WORDS if word in words), "not compared")
+        return next((word for word in reversed(ANSWERS) if word in words), "not compared")
 
 
 def run_fleet(

@@ -15,9 +15,8 @@ from matplotlib.figure import Figure
 from ..calibration.comparison.mounting_change import Change, Comparison
 from ..calibration.results.extrinsics import N_COMPONENTS, Extrinsics
 from ..fleet_catalogue.vehicle_history import CompassDeviation
-from .comparison import ComparedQuantity, shown_quantities
+from .comparison import ComparedQuantity, deviation, shown_quantities
 from .figure_style import INK, Picture, drawing, legend_above, new_figure, picture
-from .fleet import deviation
 
 _POINT, _MOVED = "#1f6fb2", "#c0392b"
 PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3

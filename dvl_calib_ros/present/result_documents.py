@@ -14,12 +14,11 @@ from ..examination.examine import Examination
 from ..fleet_catalogue.update import Fleet
 from ..unpaired.results import UnpairedComparison, unpaired_document
 from ..unpaired.simulator_rounds import ClosedGap, closed_gap_document
-from .comparison import comparison
+from .comparison import comparison, fleet
 from .diagnosis import diagnosis
 from .document import Document
 from .evaluation import cross_check, evaluation
 from .examination import examination
-from .fleet import fleet
 from .unpaired import unpaired
 
 DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
