@@ -16,9 +16,8 @@ from ..errors import InputError
 from ..simulation.scenario import Scenario
 from ..verdict.answering import Answering
 from .analyse import compare, diagnose, doctor, evaluate, fleet, replay, simulate
-from .calibrated import Calibration, Mounting
+from .calibrated import Calibration, Mounting, framed, printed
 from .convert import apply, export, import_files, instrument_settings, report, salvage
-from .output import framed, printed
 
 __all__ = [
     "Calibration",
