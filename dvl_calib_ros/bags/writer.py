@@ -47,12 +47,6 @@ class Compression(Enum):
     FILE = "file"
 
 
-_COMPRESSION = {
-    Compression.NONE: CompressionMode.NONE,
-    Compression.CHUNK: CompressionMode.STORAGE,
-    Compression.MESSAGE: CompressionMode.MESSAGE,
-    Compression.FILE: CompressionMode.FILE,
-}
 UNKNOWN_HASH = f"RIHS01_{'0' * 64}"
 
 
@@ -160,12 +154,10 @@ class BagWriter:
         """Open one more file of the bag."""
         number = len(self._parts)
         path = self._path / f"{self._path.name}_{number}" if number else self._path
-        writer = _Writer(
-            path,
-            version=9,
-            storage_plugin=StoragePlugin.MCAP if self._storage is Storage.MCAP else StoragePlugin.SQLITE3,
-        )
-        writer.set_compression(_COMPRESSION[self._compression], CompressionFormat.ZSTD)
+        writer = _Writer(path, version=9, storage_plugin=StoragePlugin[self._storage.name])
+        is_chunk = self._compression is Compression.CHUNK
+        mode = CompressionMode.STORAGE if is_chunk else CompressionMode[self._compression.name]
+        writer.set_compression(mode, CompressionFormat.ZSTD)
         writer.open()
         self._parts.append(_Part(writer))
         return self._parts[-1]

@@ -49,6 +49,7 @@ from ..files.result_file import (
 )
 from ..messages.decode import RESTAMP_ALL, frame_name, heading_variance
 from ..messages.live_feed import MessageFeed
+from ..recordings.topics import Topics
 from ..standard_streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
@@ -83,8 +84,7 @@ class CalibrationNode(AnsweringNode):
         named = set(self.get_parameters_by_prefix(""))
         parameters = declare_parameters(self, parameter_files)
         self._parameter_files = parameter_files
-        dvl_class = velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields)
-        gnss_class = velocity_class("gnss_type", parameters.gnss_type)
+        classes = _message_classes(parameters)
         self._result_folder = Path(parameters.result_file).absolute().parent if parameters.result_file else Path.cwd()
         self._check_result_file(parameters.result_file)
         initial = None
@@ -129,9 +129,8 @@ class CalibrationNode(AnsweringNode):
         # the node's own name of an input -> the discovered topic
         self._found_names: dict[str, str] = {}
         self._found: list[Reason] = []
-        self._subscribe(dvl_class, "dvl/twist")
-        self._subscribe(gnss_class, "gnss/twist")
-        self._subscribe(Imu, "imu/data")
+        for own, message_type in classes.items():
+            self._subscribe(message_type, own)
         topics = {own: subscription.topic_name for own, subscription in self._inputs.items()}
         _check_distinct(topics | {"~/calibrated_twist": self._corrected_publisher.topic_name})
         now_s = self._pauses.running_s(steady_s())
@@ -154,11 +153,10 @@ class CalibrationNode(AnsweringNode):
 
     def _named_topics(self, *, has_dvl: bool) -> dict[str, str | None]:
         """Return the topics that a search must keep, by role: remapped ones and, next to a DVL, published ones."""
-        roles = {"dvl": "dvl/twist", "gnss": "gnss/twist", "imu": "imu/data"}
-        topics = {role: self._inputs[own].topic_name for role, own in roles.items()}
+        topics = {role: (own, self._inputs[own].topic_name) for role, own in vars(Topics()).items()}
         return {
-            role: topic if roles[role] in self._remapped or (has_dvl and self.count_publishers(topic)) else None
-            for role, topic in topics.items()
+            role: topic if own in self._remapped or (has_dvl and self.count_publishers(topic)) else None
+            for role, (own, topic) in topics.items()
         }
 
     def _discover(self) -> None:
@@ -190,15 +188,9 @@ class CalibrationNode(AnsweringNode):
             self.warn(str(topics_found))
         for doubt in discovery.doubts:
             self.warn(doubt)
-        topics = discovery.topics
-        names = {"dvl/twist": topics.dvl, "gnss/twist": topics.gnss, "imu/data": topics.imu}
-        present = {name for name, _ in self.get_topic_names_and_types()}
-        self._found_names = {name_used: name for name_used, name in names.items() if name in present}
-        classes = {
-            "dvl/twist": velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields),
-            "gnss/twist": velocity_class("gnss_type", parameters.gnss_type),
-            "imu/data": Imu,
-        }
+        present, classes = dict(self.get_topic_names_and_types()), _message_classes(parameters)
+        names = zip(classes, vars(discovery.topics).values(), strict=True)
+        self._found_names = {name_used: name for name_used, name in names if name in present}
         for name_used in self._found_names:
             old = self._inputs[name_used]
             self._subscribe(classes[name_used], name_used)
@@ -569,6 +561,15 @@ class CalibrationNode(AnsweringNode):
             self._discovering.close()
         self._worker.shutdown(cancel_futures=True)
         super().destroy_node()
+
+
+def _message_classes(parameters: Parameters) -> dict[str, type]:
+    """Return the message class of each input, by the node's own name of its topic. Raises InputError."""
+    return {
+        Topics.dvl: velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields),
+        Topics.gnss: velocity_class("gnss_type", parameters.gnss_type),
+        Topics.imu: Imu,
+    }
 
 
 def _check_distinct(topics: Mapping[str, str]) -> None:

@@ -19,7 +19,7 @@ REPEATED_EVERY_S = 1.0
 
 
 class Ending:
-    """Context manager that records requests to end. Enter it in the main thread as early as possible.
+    """Context manager that notes an end as `requested`. Enter it in the main thread as early as possible.
 
     After a request, further signals are ignored on exit, because the process is about to end; else the previous signal
     handlers are restored.
@@ -31,7 +31,7 @@ class Ending:
 
     def __init__(self, closed: int | None = None) -> None:
         # no threading.Event: setting it takes a lock, on which a signal handler could block itself
-        self._requested = False
+        self.requested = False
         self._functions: list[Callable[[], object]] = []
         self._closed = closed
 
@@ -53,11 +53,6 @@ class Ending:
         self._thread.join()
         self._reading.close()
 
-    @property
-    def requested(self) -> bool:
-        """Return whether an end was requested."""
-        return self._requested
-
     def call_on_request(self, function: Callable[[], object]) -> None:
         """Call a function repeatedly, from another thread, from a request until `stop_calling`."""
         self._functions.append(function)
@@ -69,7 +64,7 @@ class Ending:
         self._functions.clear()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._requested = True
+        self.requested = True
 
     def _watch(self) -> None:
         """Wait for a signal or a closed terminal, then call the registered functions repeatedly until `__exit__`."""
@@ -85,7 +80,7 @@ class Ending:
             if self._closed in ready:
                 watched.remove(self._closed)
             if self._closed in ready or not set(END_SIGNALS).isdisjoint(numbers):
-                self._requested = True
+                self.requested = True
                 self._call()
 
     def _call(self) -> None:

@@ -42,6 +42,7 @@ from .document import (
     Warned,
     Where,
     Worth,
+    columns_for,
     facts_by,
     figure,
     figures,
@@ -86,9 +87,10 @@ HELD_OUT_NOTE = (
 )
 HELD_OUT: Columns[Verification] = {
     "model": lambda each: each.model,
-    "uncorrected": lambda each: "–" if each.held_out is None else f"{each.held_out.uncorrected:.4f}",
-    "corrected": lambda each: "–" if each.held_out is None else f"{each.held_out.corrected:.4f}",
-    "predicted": lambda each: "–" if each.held_out is None else f"{each.held_out.predicted:.4f}",
+    **columns_for(
+        {kind: kind for kind in HELD_OUT_KINDS},
+        lambda each, kind: "–" if each.held_out is None else f"{getattr(each.held_out, kind):.4f}",
+    ),
     "samples": lambda each: "0" if each.held_out is None else str(each.held_out.samples),
     "verdict": lambda each: Cell(each.verdict.value, CELL_KINDS[each.verdict]),
 }
