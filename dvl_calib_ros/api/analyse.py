@@ -15,8 +15,8 @@ from ..calibration.models.parameters import Parameters
 from ..diagnosis.answer.results import Diagnosis
 from ..discovery.discovery import Given
 from ..errors import InputError
-from ..examination.examine import Examination
-from ..simulation.scenario import Scenario
+from ..examination.examine import Examination, examine, judged_replay, rejection
+from ..simulation.scenario import Scenario, write_bag
 from ..simulation.trajectories import TRAJECTORIES, Waves
 from .arguments import Bags, StrPath, as_paths, discovered_in, parameters_from
 from .calibrated import Calibration
@@ -84,7 +84,6 @@ def diagnose(
     if rounds is not None or keep is not None:
         raise InputError("rounds, keep: only with simulator")
     from ..diagnosis.diagnose import diagnose as run
-    from ..examination.examine import rejection
 
     recording, discovery = discovered_in(as_paths(bags), topics, params, parameters)
     diagnosis = run(recording, discovery.diagnosed.replace(min_speed=slow["min_speed"]), discovery.topics)
@@ -123,7 +122,6 @@ def simulate(
     """
     from ..bags.writer import Compression, Storage
     from ..simulation.injection import injection_of
-    from ..simulation.scenario import write_bag
 
     if scenario is not None and scenario_fields:
         raise InputError("simulate: give a scenario or fields of one, not both")
@@ -250,8 +248,6 @@ def replay(
     ----------
     The models M1 to M7 are by Yampolsky and Klein, Information-Aided DVL Calibration; see the page Models.
     """
-    from ..examination.examine import judged_replay
-
     paths = as_paths(bags)
     recording, discovery = discovered_in(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
     replayed = judged_replay(recording, discovery, merge=merge, with_history=history)
@@ -414,7 +410,5 @@ def doctor(
     InputError, ParameterError
         See `replay`.
     """
-    from ..examination.examine import examine
-
     merged, names = parameters_from(params, parameters)
     return examine(as_paths(bags), merged, Given(dvl_topic, gnss_topic, imu_topic, names))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..bag_replay.replay import Replayed
+from ..bag_replay.replay import Replayed, replay_document
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
@@ -357,8 +357,6 @@ class Calibration:
         dict
             As docs/json_schema.json describes.
         """
-        from ..bag_replay.replay import replay_document
-
         return replay_document(self.replayed, models) | {"discovery": self.discovery.document()}
 
 

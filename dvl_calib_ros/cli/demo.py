@@ -21,7 +21,6 @@ from . import common
 from .watch import node_command
 
 if TYPE_CHECKING:
-    from ..bag_replay.replay import Replayed
     from ..calibration.results.results import Result
 
 BAG = "harbour_box"
@@ -41,7 +40,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     Return 0 if both agree, else 1.
     """
+    from ..bag_replay.replay import replay
     from ..calibration.models import MODELS
+    from ..files.parameter_files import load_parameters
     from ..present.replay import replayed
 
     if not 0.1 <= arguments.speed <= 1000.0:
@@ -69,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; its log: {log.read()[-2000:]}")
-        offline = _replay_offline(bag, latency, with_history=arguments.report is not None)
+        offline = replay([bag], load_parameters(None, [latency]), with_history=arguments.report is not None)
         agree = _compare(out, saved, offline.result)
     _show_diagnosis(out, bag)
     if arguments.report is not None:
@@ -114,14 +115,6 @@ def _truth() -> dict[str, float]:
     misalignment, scale = equivalent_error_terms(errors)
     angles = dict(zip(("phi_x", "phi_y", "phi_z"), map(math.degrees, misalignment), strict=True))
     return angles | {"delta_k": 100.0 * scale[0]}
-
-
-def _replay_offline(bag: Path, latency: str, with_history: bool) -> Replayed:
-    """Replay the bag with the node's latency."""
-    from ..bag_replay.replay import replay
-    from ..files.parameter_files import load_parameters
-
-    return replay([bag], load_parameters(None, [latency]), with_history=with_history)
 
 
 def _compare(out: Any, saved: Path, offline: Result) -> bool:

@@ -27,7 +27,7 @@ from ..errors import InputError
 from ..messages.encode import SampleWriter, SatelliteFix
 from .dvl_log import DvlLog, imu_samples
 from .dvl_logs import is_dvl_log, read_dvl_log
-from .pd0_nmea import KNOT
+from .pd0_nmea import KNOT, is_nmea, read_rmc
 
 # Columns of numbers and stamps in CSV files.
 
@@ -309,8 +309,6 @@ def import_recording(
 
 def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[ReferenceSample]:
     """Read the reference velocities of a file by its kind; none from positions."""
-    from .pd0_nmea import is_nmea, read_rmc
-
     if is_nmea(path):
         return read_rmc(path, options.gnss_std, notes)
     if names_columns(path, "speed", "course"):
