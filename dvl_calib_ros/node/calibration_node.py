@@ -54,9 +54,9 @@ from ..standard_streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
-from .executor import Arrived, in_order_of_arrival, take
 from .live_checks import GravitySeen, LateClocks, Pauses, steady_s
 from .live_discovery import Discovering
+from .message_queue import Arrived, in_order_of_arrival, take
 from .message_types import empty_twist, fill_errors, set_stamp, velocity_class
 from .operator_card import Card
 from .ros_parameters import declare_parameters

@@ -15,7 +15,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from ..calibration.checks.speed_of_sound import Water
 from ..errors import InputError
 from ..messages.water_properties import WaterCollector, readers, water_of
-from .executor import take
+from .message_queue import take
 from .message_types import message_class
 
 # interval of the search for new topics, s, and number of last readings kept per topic, one per second

@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvl_calib_ros.node.executor import Arrived, in_order_of_arrival
+from dvl_calib_ros.node.message_queue import Arrived, in_order_of_arrival
 
 
 def take(queue):
