@@ -1,9 +1,10 @@
-"""Options, progress, reports and tables that several commands share."""
+"""Options, profiles, progress, reports and tables that several commands share."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,8 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from ..errors import InputError, needing_page, needing_ros, printable
 from ..recordings.topics import Topics
-from ..standard_streams import give_up
-from . import profile
+from ..standard_streams import give_up, say
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """Add --params and -p, as in ROS 2, and --profile, which stores them."""
-    profile.add_option(parser)
+    add_profile_option(parser)
     parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
     override = parser.add_argument(
         "-p", dest="overrides", action="append", default=[], metavar="NAME:=VALUE", help="set one parameter; repeatable"
@@ -338,3 +338,71 @@ def result_files(arguments: argparse.Namespace, result: Any) -> list[tuple[Path 
         write_json(path, PLAIN_DATA[type(result)](result))
 
     return [(arguments.json, write_plain_data), (arguments.report, partial(write_page, result=result))]
+
+
+# A vehicle's topics and parameters, stored in a file and used by every command that takes them.
+
+IN_FOLDER = Path(".dvl-calib.yaml")
+# Options that a profile may hold next to `parameters`. None names an output file.
+OPTIONS = ("dvl-topic", "gnss-topic", "imu-topic", "params")
+
+
+def add_profile_option(parser: argparse.ArgumentParser) -> None:
+    """Add --profile."""
+    parser.add_argument(
+        "--profile", metavar="NAME",
+        help=f"stored topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file; default: {IN_FOLDER} of this "
+        "folder; none: without",
+    )  # fmt: skip
+
+
+def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str]:
+    """Return a command line with the profile's options in front of its own, which override them.
+
+    Prints the profile and its options on standard error. Raises InputError.
+    """
+    path = _profile_file(arguments.profile)
+    if path is None:
+        return [*argv]
+    words = _profile_words(path)
+    say(f"profile {path}: {shlex.join(words)}")
+    after = list(argv).index(arguments.command) + 1
+    return [*argv[:after], *words, *argv[after:]]
+
+
+def _profile_file(name: str | None) -> Path | None:
+    """Return the file of a profile, by default the one in the current folder, if any."""
+    if name is None:
+        return IN_FOLDER if IN_FOLDER.exists() else None
+    if name == "none":
+        return None
+    if "/" in name or name.endswith(".yaml"):
+        return Path(name)
+    folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "dvl-calib"
+    path = folder / f"{name}.yaml"
+    if not path.exists():
+        existing = ", ".join(sorted(each.stem for each in folder.glob("*.yaml"))) or "none"
+        raise InputError(f"--profile: {path} does not exist; profiles there: {existing}")
+    return path
+
+
+def _profile_words(path: Path) -> list[str]:
+    """Return a profile's content as command-line words. Raises InputError."""
+    from ..disk.text_files import load_yaml
+    from ..files.parameter_files import as_yaml
+
+    content = load_yaml(path, "profile")
+    allowed = (*OPTIONS, "parameters")
+    if not isinstance(content, dict) or not content.keys() <= set(allowed):
+        other = ", ".join(map(repr, content.keys() - set(allowed))) if isinstance(content, dict) else "no names"
+        raise InputError(f"{path}: no profile ({other}); it holds {', '.join(allowed)}")
+    parameters = content.pop("parameters", {})
+    if not isinstance(parameters, dict):
+        raise InputError(f"{path}: parameters is not a list of name: value")
+    for name, value in content.items():
+        if not isinstance(value, str):
+            raise InputError(f"{path}: {name} is no text")
+    if "params" in content:  # the path is relative to the profile
+        content["params"] = path.parent / content["params"]
+    words = [f"--{name}={value}" for name, value in content.items()]
+    return words + [word for name, value in parameters.items() for word in ("-p", f"{name}:={as_yaml(value)}")]
