@@ -13,7 +13,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
-from ..errors import InputError, printable
 from ..standard_streams import give_up, open_streams, say
 from ..version import __version__
 from .commands import COMMANDS
@@ -34,6 +33,8 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the usage error in one line and exit with 2."""
+        from ..errors import printable
+
         self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
 
     def parse_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def, override]
@@ -108,6 +109,7 @@ def _run(argv: Sequence[str]) -> int:
     parser = build_parser(argv)
     arguments = parser.parse_args(argv)
     from ..calibration.models.parameters import ParameterError
+    from ..errors import InputError
 
     recordings = recordings_now(arguments)
     try:
