@@ -104,13 +104,11 @@ def _middle_day(each: Extrinsics) -> float:
 
 def compass(known: Sequence[tuple[str, CompassDeviation]]) -> Figure:
     """Draw the deviation over the heading, one line per vehicle."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="heading from north, clockwise, °", ylabel="deviation, °")
     north = np.linspace(0.0, 360.0, 181)
     for name, heading in known:
         axes.plot(north, deviation(heading, 0.5 * math.pi - np.radians(north)), label=name)
-    axes.set_xlabel("heading from north, clockwise, °")
     axes.set_xlim(0.0, 360.0)
     axes.set_xticks(range(0, 361, 45))
-    axes.set_ylabel("deviation, °")
     legend_above(axes)
     return figure

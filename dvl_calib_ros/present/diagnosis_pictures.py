@@ -60,14 +60,13 @@ _STYLES = {
 
 def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], points: int, label: str) -> Figure:
     """Draw running means over `points` samples of series (M,), m/s, by name; the last in front."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(ylabel=label)
     t = time(stamps_ns)
     for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
         where, mean = running_mean(t, MM * values, points)
         kept = slice(None, None, max(1, len(where) // LINE_POINTS))
         axes.plot(where[kept], mean[kept], color=colour, linewidth=width, label=name)
     axes.axhline(0.0, color=INK, linewidth=0.7)
-    axes.set_ylabel(label)
     time.label_time(axes)
     legend_above(axes)
     return figure
@@ -80,13 +79,11 @@ def _line_styles(names: Sequence[str]) -> list[tuple[str, float]]:
 
 def spectra(frequency: Array, series: Mapping[str, Array], label: str) -> Figure:
     """Draw amplitude spectral densities (F,) m/s/√Hz of one body axis, by name, over frequency (F,) Hz."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="frequency, Hz", ylabel=label)
     for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
         axes.plot(frequency, MM * values, color=colour, linewidth=width, label=name)
     axes.set_ylim(*_decade_limits(MM * np.concatenate(list(series.values()))))
     log_scale(axes, "xy")
-    axes.set_xlabel("frequency, Hz")
-    axes.set_ylabel(label)
     legend_above(axes)
     return figure
 
@@ -123,7 +120,7 @@ def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
 
     The range is set by the last series; values beyond it are in the last bins.
     """
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="recorded − twin, mm/s", ylabel="density, 1/(mm/s)")
     last = list(values.values())[-1]
     reach = MM * float(max(np.quantile(np.abs(last), 0.995), 4.0 * np.max(noise)))
     edges = np.linspace(-reach, reach, BINS + 1)
@@ -134,8 +131,6 @@ def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
     std = MM * np.maximum(noise, 1e-9)[:, None]
     density = (np.exp(-0.5 * (at / std) ** 2) / (std * np.sqrt(2.0 * np.pi))).mean(axis=0)
     axes.plot(at, density, color=FAINT, linewidth=2.0, label="noise", zorder=1)
-    axes.set_xlabel("recorded − twin, mm/s")
-    axes.set_ylabel("density, 1/(mm/s)")
     axes.set_ylim(bottom=0.0)
     legend_above(axes)
     return figure
@@ -146,7 +141,7 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
 
     The range is set by the last series.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="quantiles of normal noise, mm/s", ylabel="of recorded − twin, mm/s")
     k = max(len(each) for each in values.values())
     end = float(normal_isf(0.5 / k))
     shares = normal_sf(np.linspace(end, -end, QUANTILES))
@@ -156,8 +151,6 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
     axes.plot(of_noise[[0, -1]], of_noise[[0, -1]], color=FAINT, linewidth=2.0, label="noise", zorder=1)
     for (name, each), (colour, _) in zip(values.items(), _line_styles(list(values)), strict=True):
         axes.plot(of_noise, MM * np.quantile(each, shares), ".", color=colour, markersize=3.5, label=name)
-    axes.set_xlabel("quantiles of normal noise, mm/s")
-    axes.set_ylabel("of recorded − twin, mm/s")
     reach = 1.3 * max(float(of_noise[-1]), MM * float(np.abs(list(values.values())[-1]).max()))
     axes.set_ylim(-reach, reach)
     legend_above(axes, markerscale=2.0)
@@ -166,7 +159,7 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
 
 def residual_over_regressor(plotted: RegressorPlot, label: str) -> Figure:
     """Draw the residual against its explaining variable: samples, group means with two standard errors, and scatter."""
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel=plotted.label, ylabel=label)
     at, mean, std, error = plotted.groups()
     every = slice(None, None, max(1, len(plotted.at) // SCATTER_POINTS))
     axes.plot(
@@ -178,8 +171,6 @@ def residual_over_regressor(plotted: RegressorPlot, label: str) -> Figure:
     axes.axhline(0.0, color=INK, linewidth=0.7)
     reach = 1.2 * MM * float(np.nanmax([np.quantile(np.abs(plotted.residual), 0.98), *np.abs(mean) + std]))
     axes.set_ylim(-reach, reach)
-    axes.set_xlabel(plotted.label)
-    axes.set_ylabel(label)
     legend_above(axes, markerscale=2.0)
     return figure
 
@@ -203,7 +194,7 @@ def measured_against_effect(effect: Array, measured: Array) -> Figure:
 
     Points on the diagonal mean that the effect equals the measurement.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="the effect's trace, mm/s", ylabel="measured, mm/s")
     groups = np.array_split(np.argsort(effect), GROUPS)
     at = MM * np.array([effect[group].mean() for group in groups])
     mean = MM * np.array([measured[group].mean() for group in groups])
@@ -213,8 +204,6 @@ def measured_against_effect(effect: Array, measured: Array) -> Figure:
     axes.errorbar(at, mean, error, fmt="o", markersize=4.0, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(6))
-    axes.set_xlabel("the effect's trace, mm/s")
-    axes.set_ylabel("measured, mm/s")
     legend_above(axes)
     return figure
 
@@ -419,13 +408,13 @@ def residual_over_time(shrunk: Shrunk, axis: int, models: Sequence[str]) -> Figu
     at = shrunk.recording_of == int(np.argmax(squares))
     time = shrunk.time[at]
     points = max(3, round(WINDOW_SHARE * len(time)))
-    figure, axes = new_figure()
+    figure, axes = new_figure(
+        xlabel="time from the start, s", ylabel=f"recorded less simulated, {DVL_AXES[axis]}, mm/s"
+    )
     for model, colour in zip(models, (BAD, AFTER), strict=True):
         where, mean = running_mean(time, MM * shrunk.errors[model][at, axis], points)
         axes.plot(where, mean, color=colour, label=AS_IT_IS if model == AS_IT_IS else "with all effects")
     axes.axhline(0.0, color=INK, linewidth=0.7)
-    axes.set_xlabel("time from the start, s")
-    axes.set_ylabel(f"recorded less simulated, {DVL_AXES[axis]}, mm/s")
     legend_above(axes)
     return figure
 
@@ -468,11 +457,9 @@ def residual_spectrum(values: Array, interval: float) -> tuple[Array, Array]:
 
 def residual_spectra(lines: Mapping[str, tuple[Array, Array]]) -> Figure:
     """Draw amplitude spectral densities of both sides, m/s/√Hz."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="frequency, Hz", ylabel="mm/s/√Hz")
     for (side, (frequency, density)), colour in zip(lines.items(), (INK, AFTER), strict=True):
         axes.plot(frequency, MM * np.maximum(density, 1e-7), color=colour, label=side)
     log_scale(axes, "xy")
-    axes.set_xlabel("frequency, Hz")
-    axes.set_ylabel("mm/s/√Hz")
     legend_above(axes)
     return figure

@@ -30,7 +30,7 @@ def improvement_bars(models: Sequence[str], improvement: Array, published: Array
     improvement, published: (S, M) removed share of Avg.VRMSE, nan if missing. Bars are means over the sets, points the
     sets, rings the published figures.
     """
-    figure, axes = new_figure(height=1.2 + 0.3 * len(models))
+    figure, axes = new_figure(height=1.2 + 0.3 * len(models), xlabel="reduction of the uncalibrated Avg.VRMSE, %")
     rows = np.arange(len(models))
     mean = 100.0 * improvement.mean(axis=0)
     axes.barh(rows, mean, color=[MODEL_STYLES[name].color for name in models], height=0.62, alpha=0.85)
@@ -45,7 +45,6 @@ def improvement_bars(models: Sequence[str], improvement: Array, published: Array
     axes.axvline(0.0, color=INK, linewidth=0.8)
     axes.set_yticks(rows, models)
     axes.invert_yaxis()
-    axes.set_xlabel("reduction of the uncalibrated Avg.VRMSE, %")
     axes.grid(False, axis="y")
     legend_above(axes)
     return figure
@@ -63,7 +62,7 @@ def error_over_calibration_time(
 
     uncalibrated: m/s. published: (M,) m/s at published_window_s, nan if missing.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="calibration time, s", ylabel="Avg.VRMSE, m/s")
     finite = [window for window in windows_s if window is not None]
     all_at = (max(finite) if finite else 0.0) + ALL_STANDS_S
     at = np.array([all_at if window is None else window for window in windows_s])
@@ -83,8 +82,6 @@ def error_over_calibration_time(
     log_scale(axes, "y")
     ticks = [window for window in finite if window % 50.0 == 0.0]
     axes.set_xticks([*ticks, all_at], [*(f"{tick:g}" for tick in ticks), "all"])
-    axes.set_xlabel("calibration time, s")
-    axes.set_ylabel("Avg.VRMSE, m/s")
     return figure
 
 
@@ -99,7 +96,7 @@ def misalignment_over_time(
 
     published: s and ° of a published method.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="calibration time, s", ylabel="error, ° rms")
     for name, std, values in zip(models, gnss_std, degrees, strict=True):
         dashes = ":" if std is None else "--" if std < 0.1 else "-"
         with_what = "no reference" if std is None else f"{std:g} m/s"
@@ -109,8 +106,6 @@ def misalignment_over_time(
         )  # fmt: skip
     axes.plot(*published, "*", color=INK, markersize=9.0)
     log_scale(axes, "xy")
-    axes.set_xlabel("calibration time, s")
-    axes.set_ylabel("error, ° rms")
     legend_above(axes)
     return figure
 

@@ -124,10 +124,10 @@ def drawing() -> AbstractContextManager[None]:
     return matplotlib.rc_context(_SETTINGS)
 
 
-def new_figure(height: float = HEIGHT) -> tuple[Figure, Axes]:
-    """Return a figure with one pair of axes; height in inches."""
+def new_figure(height: float = HEIGHT, xlabel: str = "", ylabel: str = "") -> tuple[Figure, Axes]:
+    """Return a figure with one pair of axes, labelled; height in inches."""
     figure = Figure(figsize=(WIDTH, height))
-    return figure, figure.add_subplot()
+    return figure, figure.add_subplot(xlabel=xlabel, ylabel=ylabel)
 
 
 def rows_figure(
@@ -138,11 +138,10 @@ def rows_figure(
     label: of the values. height, per_row: inches without rows, and of each. pad: rows of space at both ends. grid:
     whether rows have lines.
     """
-    figure, axes = new_figure(height + per_row * len(names))
+    figure, axes = new_figure(height + per_row * len(names), xlabel=label)
     rows = np.arange(len(names))
     axes.set_yticks(rows, names)
     axes.set_ylim(len(names) - (1.0 - pad), -pad)
-    axes.set_xlabel(label)
     axes.grid(grid, axis="y")
     return figure, axes, rows
 
