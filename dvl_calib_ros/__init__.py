@@ -9,8 +9,7 @@ from .version import __version__ as __version__
 TYPE_CHECKING = False  # as in typing, whose import takes longer than the rest of this module
 if TYPE_CHECKING:
     from .api import Calibration, InputError, Mounting, ParameterError, Parameters, Scenario
-    from .api.analyse import diagnose, evaluate, simulate
-    from .api.calibrate import compare, doctor, fleet, replay
+    from .api.analyse import compare, diagnose, doctor, evaluate, fleet, replay, simulate
     from .api.convert import apply, export, import_files, instrument_settings, report, salvage
 
 __all__ = [

@@ -19,6 +19,15 @@ def needing_ros(what: str) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def needing_page(what: str) -> Iterator[None]:
+    """Turn a missing library for pages into InputError. what: the option or file that needs it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise InputError(f"{what} needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2") from error
+
+
 def printable(text: str) -> str:
     """Escape control characters in a text for a terminal; names in a bag may have them."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

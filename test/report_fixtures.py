@@ -36,7 +36,8 @@ from dvl_calib_ros.evaluation.results import (
     Evaluation,
     HeldOut,
 )
-from dvl_calib_ros.present.page import write_replay_report
+from dvl_calib_ros.present.page import write_report
+from dvl_calib_ros.present.replay import replayed as document_of
 from dvl_calib_ros.verdict.reasons import finding
 
 # One of each kind: most of a report's time goes into pictures of the models' estimates
@@ -116,7 +117,7 @@ def replay_page(folder: Path, samples=None, models=FEW, **bag_options: Any) -> t
     bag = write_bag(folder / "bag", run() if samples is None else samples, **bag_options)
     replayed = recorded(bag, dvl_position="told")
     path = folder / "report.html"
-    write_replay_report(path, replayed, [bag], list(models))
+    write_report(path, document_of(replayed, [bag], list(models)))
     return path, replayed
 
 

@@ -16,7 +16,6 @@ OF_NO_RESULT = {
     "numbers",
     "page",
     "terminal",
-    "figure_data",
     "figure_style",
 }
 PARTS = {

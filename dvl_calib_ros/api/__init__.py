@@ -15,11 +15,9 @@ from ..calibration.models.parameters import ParameterError, Parameters
 from ..errors import InputError
 from ..simulation.scenario import Scenario
 from ..verdict.answering import Answering
-from .analyse import diagnose, evaluate, simulate
-from .calibrate import compare, doctor, fleet, replay
-from .calibrated import Calibration, Mounting
+from .analyse import compare, diagnose, doctor, evaluate, fleet, replay, simulate
+from .calibrated import Calibration, Mounting, framed, printed
 from .convert import apply, export, import_files, instrument_settings, report, salvage
-from .output import framed, printed
 
 __all__ = [
     "Calibration",

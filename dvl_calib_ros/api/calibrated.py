@@ -1,7 +1,8 @@
-"""Results of a replay: the mounting and the calibration."""
+"""Results of a replay: the mounting and the calibration; results of all kinds as text, HTML and data frames."""
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..bag_replay.replay import Replayed
+from ..bag_replay.replay import Replayed, replay_document
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.results.mounting_quantities import LATE, Quantity, quantities
 from ..discovery.discovery import Discovery
 from ..errors import InputError, printable
+from ..present.document import Document
 from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
@@ -122,7 +124,6 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         from ..present.replay import replayed
-        from .output import text_of
 
         return text_of(replayed(self.replayed, self.bags, ()), as_html=True)
 
@@ -230,7 +231,6 @@ class Calibration:
             Without pandas.
         """
         from ..present.replay import replayed
-        from .output import frames_of
 
         frames = frames_of(replayed(self.replayed, self.bags, tuple(MODELS)))
         import pandas
@@ -337,10 +337,11 @@ class Calibration:
         InputError
             If it cannot be written.
         """
-        from ..present.page import write_replay_report
+        from ..present.page import write_report
+        from ..present.replay import replayed
 
         target = Path(path)
-        write_replay_report(target, self.replayed, self.bags, list(MODELS))
+        write_report(target, replayed(self.replayed, self.bags, list(MODELS)))
         return target
 
     def document(self, models: Sequence[str] = tuple(MODELS)) -> dict[str, Any]:
@@ -356,8 +357,6 @@ class Calibration:
         dict
             As docs/json_schema.json describes.
         """
-        from ..bag_replay.replay import replay_document
-
         return replay_document(self.replayed, models) | {"discovery": self.discovery.document()}
 
 
@@ -390,3 +389,48 @@ def _vectors(name: str, given: Array) -> Array:
 def _given(value: float) -> Quantity:
     """Return a quantity that the model does not estimate, with its configured value."""
     return Quantity("", value, value, math.nan, "", False)
+
+
+# Results as text, as HTML for a notebook, and as data frames.
+
+# Width of printed output in columns, equal to the commands' output into a pipe.
+WIDTH = 160
+
+
+def printed(result: object, as_html: bool) -> str:
+    """Format a result with its tables, as text or HTML."""
+    from ..present.result_documents import DOCUMENTS
+
+    return text_of(DOCUMENTS[type(result)](result), as_html)
+
+
+def framed(result: object) -> dict[str, pandas.DataFrame]:
+    """Return the tables of a result by their headings. Raises InputError without pandas."""
+    from ..present.result_documents import DOCUMENTS
+
+    return frames_of(DOCUMENTS[type(result)](result))
+
+
+def frames_of(document: Document) -> dict[str, pandas.DataFrame]:
+    """Return the tables of a document by their headings. Raises InputError without pandas."""
+    try:
+        return document.frames()
+    except ModuleNotFoundError:
+        raise InputError("tables need the Python package pandas; pip install pandas") from None
+
+
+def text_of(document: Document, as_html: bool) -> str:
+    """Render a document as on a terminal, as text or as HTML."""
+    if as_html:
+        from ..present.page import fragment
+
+        return fragment(document)
+    from rich.console import Console
+
+    from ..present.terminal import shown
+
+    # force_jupyter: rich would otherwise also display the text by itself in a notebook
+    console = Console(file=io.StringIO(), record=True, width=WIDTH, force_jupyter=False, highlight=False, emoji=False)
+    for each in shown(document):
+        console.print(each)
+    return "\n".join(line.rstrip() for line in console.export_text().splitlines())

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..calibration.comparison.mounting_change import Comparison
 from ..diagnosis.answer.results import Diagnosis
 from ..disk.text_files import write_json
-from ..errors import InputError
+from ..errors import InputError, needing_page
 from ..examination.examine import Examination
 from .arguments import Bags, StrPath, as_path, as_paths, storage_and_compression
 from .calibrated import Calibration
 
 if TYPE_CHECKING:
-    from ..bags.recover import Recovered
+    from ..bags.writer import Recovered
     from ..evaluation.cross_check import CrossCheck
     from ..evaluation.results import Evaluation
     from ..files.mounting import Applied
@@ -48,7 +47,7 @@ def salvage(bags: Bags, output: StrPath, *, storage: str = "mcap", compression: 
     InputError
         For a path that is no bag or holds no message, and if the new bag cannot be written.
     """
-    from ..bags.recover import recover
+    from ..bags.writer import recover
 
     return recover(as_paths(bags), Path(output), *storage_and_compression(storage, compression))
 
@@ -247,54 +246,19 @@ def report(
     InputError
         If the file cannot be written, or the page needs a missing history or library.
     """
-    target = Path(path)
-    write(result, target)
-    return target
+    from ..present.result_documents import PLAIN_DATA
 
-
-# Results as pages and as JSON files.
-
-
-def write(result: object, path: Path) -> None:
-    """Write a result as JSON if the path ends in .json, else as a page. Raises InputError."""
-    document = _document_function(result)
-    if path.suffix.lower() == ".json":
-        write_json(path, document())
-        return
-    if isinstance(result, Calibration):
-        result.report(path)
-        return
-    try:
-        from ..present import page
-    except ModuleNotFoundError as error:
+    target, kind = Path(path), type(result)
+    if not isinstance(result, Calibration) and kind not in PLAIN_DATA:
         raise InputError(
-            f"{path}: a page needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2"
-        ) from error
-    page.write_report(path, result)
-
-
-def _document_function(result: Any) -> Callable[[], Any]:
-    """Return the function that makes plain data of a result. Raises InputError for other objects."""
-    if isinstance(result, Calibration | Examination):
-        return result.document
-    from ..calibration.comparison.mounting_change import comparison_document
-    from ..diagnosis.answer.results import diagnosis_document
-    from ..evaluation.cross_check import CrossCheck, cross_check_document
-    from ..evaluation.documents import evaluation_document
-    from ..evaluation.results import Evaluation
-    from ..unpaired.results import UnpairedComparison, unpaired_document
-    from ..unpaired.simulator_rounds import ClosedGap, closed_gap_document
-
-    documents: dict[type, Callable[[Any], Any]] = {
-        Comparison: comparison_document,
-        Diagnosis: diagnosis_document,
-        Evaluation: evaluation_document,
-        CrossCheck: cross_check_document,
-        UnpairedComparison: unpaired_document,
-        ClosedGap: closed_gap_document,
-    }
-    if type(result) not in documents:
-        raise InputError(
-            f"a {type(result).__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
+            f"a {kind.__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
         )
-    return partial(documents[type(result)], result)
+    if target.suffix.lower() == ".json":
+        write_json(target, result.document() if isinstance(result, Calibration) else PLAIN_DATA[kind](result))
+    elif isinstance(result, Calibration):
+        result.report(target)
+    else:
+        with needing_page(f"{target}: a page"):
+            from ..present import page
+        page.write_report(target, result)
+    return target

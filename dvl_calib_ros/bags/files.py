@@ -116,10 +116,11 @@ def unreadable(file: Any) -> int:
     return sum(last - first for first, last in holes)
 
 
+# the other modules of this room import it from here
 if sys.version_info >= (3, 14):
-    from compression import zstd
+    from compression import zstd as zstd
 else:
-    from backports import zstd
+    from backports import zstd as zstd
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 STORAGE_SUFFIXES = (".mcap", ".db3", ".bag")

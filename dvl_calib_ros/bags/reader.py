@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import heapq
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from operator import itemgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rosbags.typesys.store import Typestore
@@ -18,14 +16,9 @@ from rosbags.typesys.store import Typestore
 from ..errors import InputError
 from .batches import BagMessage, Batch, batched, one_batch
 from .channels import Channel, Decoder, DecodingError
-from .files import ZSTD_MAGIC, files_of
+from .files import ZSTD_MAGIC, files_of, zstd
 from .salvage.damage import LARGEST_RECORD
 from .sources import DAMAGE, Source, message_of, open_source
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
 
 # a plain tuple per message, because a named one would cost a third of the decoding time
 DecodedMessage = tuple[str, int, Any, str]
@@ -59,9 +52,7 @@ class BagReader:
     def __enter__(self) -> BagReader:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -23,7 +23,17 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from ..errors import InputError
-from .batches import LATEST_NS, MOST_BYTES, MOST_MESSAGES, BagMessage, Batch, batched, by_log_time, one_batch, times
+from .batches import (
+    LATEST_NS,
+    MOST_BYTES,
+    MOST_MESSAGES,
+    BagMessage,
+    Batch,
+    batched,
+    by_log_time,
+    numbered_batch,
+    one_batch,
+)
 from .channels import DECODING, KEPT, SEPARATOR, Channel, Definition, DefinitionError, definition_of, typestore
 from .files import ZSTD_MAGIC, NewFolder, decompressed, open_raw, storage_suffix, with_journal
 from .salvage.damage import LARGEST_RECORD, DamagedError, Salvaged
@@ -427,16 +437,11 @@ class Database:
                 log_ns, number, data = zip(*rows, strict=True)
                 sound = _count_valid(log_ns, data)
                 if sound:
-                    yield self._batch(log_ns[:sound], number[:sound], data[:sound])
+                    yield numbered_batch(log_ns[:sound], number[:sound], data[:sound], self._channels)
                 if sound < len(rows):
                     raise DamagedError("a message is missing or damaged")
             if error is not None:
                 raise error
-
-    def _batch(self, log_ns: Sequence[int], number: Sequence[int], data: Sequence[bytes]) -> Batch:
-        end = np.cumsum([*map(len, data)], dtype=np.intp)
-        start = np.concatenate([[0], end[:-1]]).astype(np.intp)
-        return Batch(times(log_ns), np.array(number, dtype=np.intp), start, end, b"".join(data), self._channels)
 
     def _connection(self) -> sqlite3.Connection:
         # immutable: SQLite looks for no journal and no lock, so that it writes nothing next to a recording

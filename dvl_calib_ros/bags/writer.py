@@ -1,15 +1,17 @@
-"""Writing of new rosbag2 recordings by rosbags, with attachments for MCAP."""
+"""Writing of new rosbag2 recordings by rosbags, with attachments for MCAP, and recovery of damaged ones."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import sqlite3
+from collections import Counter
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import yaml
@@ -26,6 +28,7 @@ from ..disk.text_files import load_yaml
 from ..errors import InputError
 from .batches import LATEST_NS
 from .channels import Channel, Definition, DefinitionError, typestore
+from .reader import BagReader
 
 
 class Storage(Enum):
@@ -44,12 +47,6 @@ class Compression(Enum):
     FILE = "file"
 
 
-_COMPRESSION = {
-    Compression.NONE: CompressionMode.NONE,
-    Compression.CHUNK: CompressionMode.STORAGE,
-    Compression.MESSAGE: CompressionMode.MESSAGE,
-    Compression.FILE: CompressionMode.FILE,
-}
 UNKNOWN_HASH = f"RIHS01_{'0' * 64}"
 
 
@@ -160,12 +157,10 @@ class BagWriter:
         """Open one more file of the bag."""
         number = len(self._parts)
         path = self._path / f"{self._path.name}_{number}" if number else self._path
-        writer = _Writer(
-            path,
-            version=9,
-            storage_plugin=StoragePlugin.MCAP if self._storage is Storage.MCAP else StoragePlugin.SQLITE3,
-        )
-        writer.set_compression(_COMPRESSION[self._compression], CompressionFormat.ZSTD)
+        writer = _Writer(path, version=9, storage_plugin=StoragePlugin[self._storage.name])
+        is_chunk = self._compression is Compression.CHUNK
+        mode = CompressionMode.STORAGE if is_chunk else CompressionMode[self._compression.name]
+        writer.set_compression(mode, CompressionFormat.ZSTD)
         writer.open()
         self._parts.append(_Part(writer))
         return self._parts[-1]
@@ -261,3 +256,35 @@ def attach(path: Path, name: str, media_type: str, data: bytes, compressed: bool
         writer.add_attachment(start_ns, start_ns, name, media_type, data)
         writer.finish()  # type: ignore[no-untyped-call]
     os.replace(new, path)
+
+
+PROGRESS_EVERY = 1000
+
+
+class Recovered(NamedTuple):
+    """Result of a recovery. counts: messages of each topic. notes: sentences on the losses."""
+
+    counts: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def recover(
+    bags: Sequence[Path],
+    output: Path,
+    storage: Storage = Storage.MCAP,
+    compression: Compression = Compression.NONE,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> Recovered:
+    """Write every readable message of every topic into a new bag. Raises InputError."""
+    counts: Counter[str] = Counter()
+    with BagReader(bags) as reader:
+        topics, total = reader.topics, max(sum(reader.message_counts.values()), 1)
+        if not topics:
+            raise InputError(f"{', '.join(map(str, bags))}: there is no message in it; record it again")
+        with BagWriter(output, storage, compression) as writer:
+            for number, (log_ns, channel, data) in enumerate(reader.raw_messages(topics)):
+                writer.raw(channel, log_ns, data)
+                counts[channel.topic] += 1
+                if number % PROGRESS_EVERY == 0:
+                    on_progress(number / total)
+        return Recovered(dict(sorted(counts.items())), tuple(reader.notes))

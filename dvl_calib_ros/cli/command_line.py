@@ -114,7 +114,7 @@ def _run(argv: Sequence[str]) -> int:
     recordings = recordings_now(arguments)
     try:
         if hasattr(arguments, "profile"):
-            from .profile import with_profile
+            from .common import with_profile
 
             arguments = parser.parse_args(with_profile(argv, arguments))
         if "" in argv and any(str(path) == "." for path in paths_in(arguments)):  # pathlib turns an empty name into "."

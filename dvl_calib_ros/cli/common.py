@@ -1,18 +1,20 @@
-"""Options, progress, reports and tables that several commands share."""
+"""Options, profiles, progress, reports and tables that several commands share."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from ..errors import InputError, needing_ros, printable
-from ..standard_streams import give_up
-from . import profile
+from ..errors import InputError, needing_page, needing_ros, printable
+from ..recordings.topics import Topics
+from ..standard_streams import give_up, say
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """Add --params and -p, as in ROS 2, and --profile, which stores them."""
-    profile.add_option(parser)
+    add_profile_option(parser)
     parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
     override = parser.add_argument(
         "-p", dest="overrides", action="append", default=[], metavar="NAME:=VALUE", help="set one parameter; repeatable"
@@ -45,14 +47,14 @@ def _parameter_completions(**_: Any) -> list[str]:
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:
     """Add --dvl-topic, --gnss-topic and --imu-topic of the node."""
-    for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
+    for role, default in vars(Topics()).items():
         parser.add_argument(f"--{role}-topic", default=default, metavar="TOPIC", help=f"default: {default}")
 
 
 def add_discovery_options(parser: argparse.ArgumentParser) -> None:
     """Add the parameters, and the topics of recordings, whose defaults are found by type and content."""
     add_parameter_options(parser)
-    for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
+    for role, default in vars(Topics()).items():
         none = "" if role == "dvl" else "; none: do without"
         help_ = f"default: {default}, else found by type and content{none}"
         parser.add_argument(f"--{role}-topic", metavar="TOPIC", help=help_)
@@ -153,6 +155,8 @@ def check_outputs(
 ) -> None:
     """Raise InputError before work is done if an output cannot be written or is also an input.
 
+    Also without the libraries that --report needs.
+
     files, folders: options that name outputs. All other paths in the arguments and the parameters are inputs.
     also_read: further inputs. also_written: further outputs, by their names in errors.
     """
@@ -177,6 +181,9 @@ def check_outputs(
             check_folder_writable(given[name])
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
     check_apart(as_options[0] | dict(also_written or {}), read, as_options[1])
+    if "report" in given:
+        with needing_page("--report"):
+            from ..present import page  # noqa: F401
 
 
 def console(stderr: bool = False) -> Console:
@@ -284,10 +291,9 @@ def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
     with Ending() as ending:
         with needing_ros(what):
             import rclpy
-            from rclpy.signals import SignalHandlerOptions
 
-            from ..node.services import AnsweringNode
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+            from ..node.services import AnsweringNode, init_ros
+        init_ros([])
         node = AnsweringNode(name)
         try:
             yield node, ending
@@ -316,21 +322,87 @@ def add_report_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report to look at (HTML, one file)")
 
 
-def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> Callable[..., None]:
-    """Return a function of present/page.py, which must not be called without --report.
+def write_page(path: Path, result: object) -> None:
+    """Write a result's report, as `page.write_report`."""
+    from ..present.page import write_report
 
-    Raises InputError, before any work is done, if a library for reports is missing.
+    write_report(path, result)
+
+
+def result_files(arguments: argparse.Namespace, result: Any) -> list[tuple[Path | None, Callable[[Path], object]]]:
+    """Return --json and --report with the functions that write a result, for `deliver`."""
+
+    def write_plain_data(path: Path) -> None:
+        from ..present.result_documents import PLAIN_DATA
+
+        write_json(path, PLAIN_DATA[type(result)](result))
+
+    return [(arguments.json, write_plain_data), (arguments.report, partial(write_page, result=result))]
+
+
+# A vehicle's topics and parameters, stored in a file and used by every command that takes them.
+
+IN_FOLDER = Path(".dvl-calib.yaml")
+# Options that a profile may hold next to `parameters`. None names an output file.
+OPTIONS = ("dvl-topic", "gnss-topic", "imu-topic", "params")
+
+
+def add_profile_option(parser: argparse.ArgumentParser) -> None:
+    """Add --profile."""
+    parser.add_argument(
+        "--profile", metavar="NAME",
+        help="profile of topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file, or none for no profile; "
+        f"default: {IN_FOLDER} of this folder",
+    )  # fmt: skip
+
+
+def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str]:
+    """Return a command line with the profile's options in front of its own, which override them.
+
+    Prints the profile and its options on standard error. Raises InputError.
     """
-    if arguments.report is None:
-        return _no_report
-
-    try:
-        from ..present import page
-    except ModuleNotFoundError as error:
-        raise InputError(f"--report needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2") from error
-    write: Callable[..., None] = getattr(page, name)
-    return write
+    path = _profile_file(arguments.profile)
+    if path is None:
+        return [*argv]
+    words = _profile_words(path)
+    say(f"profile {path}: {shlex.join(words)}")
+    after = list(argv).index(arguments.command) + 1
+    return [*argv[:after], *words, *argv[after:]]
 
 
-def _no_report(*_: object) -> None:
-    raise AssertionError("--report was not given")
+def _profile_file(name: str | None) -> Path | None:
+    """Return the file of a profile, by default the one in the current folder, if any."""
+    if name is None:
+        return IN_FOLDER if IN_FOLDER.exists() else None
+    if name == "none":
+        return None
+    if "/" in name or name.endswith(".yaml"):
+        return Path(name)
+    folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "dvl-calib"
+    path = folder / f"{name}.yaml"
+    if not path.exists():
+        existing = ", ".join(sorted(each.stem for each in folder.glob("*.yaml"))) or "none"
+        raise InputError(f"--profile: {path} does not exist; profiles there: {existing}")
+    return path
+
+
+def _profile_words(path: Path) -> list[str]:
+    """Return a profile's content as command-line words. Raises InputError."""
+    from ..disk.text_files import load_yaml
+    from ..files.parameter_files import as_yaml
+
+    content = load_yaml(path, "profile")
+    allowed = (*OPTIONS, "parameters")
+    if not isinstance(content, dict) or not content.keys() <= set(allowed):
+        other = ", ".join(map(repr, content.keys() - set(allowed))) if isinstance(content, dict) else "no names"
+        raise InputError(f"{path}: no profile ({other}); it holds {', '.join(allowed)}")
+    parameters = content.pop("parameters", {})
+    if not isinstance(parameters, dict):
+        raise InputError(f"{path}: parameters is not a list of name: value")
+    for name, value in content.items():
+        if not isinstance(value, str):
+            raise InputError(f"{path}: {name} is no text")
+    if "params" in content:  # the path is relative to the profile
+        content["params"] = path.parent / content["params"]
+    words = [f"--{name}={value}" for name, value in content.items()]
+    return words + [word for name, value in parameters.items() for word in ("-p", f"{name}:={as_yaml(value)}")]

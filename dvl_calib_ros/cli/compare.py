@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 from ..errors import InputError
 from ..standard_streams import give_up
 from . import common
-from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from ..calibration.results.extrinsics import Extrinsics
@@ -28,13 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("results", nargs="+", type=Path, metavar="RESULT", help="result file (YAML), or a bag")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
-    add_report_option(parser)
+    common.add_report_option(parser)
     common.add_discovery_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Load or calibrate, compare, save, print. Return the exit code."""
-    from ..calibration.comparison.mounting_change import check_distinct, compare, comparison_document
+    from ..calibration.comparison.mounting_change import check_distinct, compare
     from ..present import comparison as present
 
     paths: list[Path] = arguments.results
@@ -44,7 +43,6 @@ def run(arguments: argparse.Namespace) -> int:
         twice = next(path for path in paths if paths.count(path) > 1)
         raise InputError(f"{twice}: named twice; a calibration cannot be compared with itself")
     common.check_outputs(arguments, "json", "report")
-    write_report = report_writer(arguments)
     names = _names(paths)
     notes: list[str] = []
     calibrations = [_load_or_calibrate(arguments, path, name, notes) for path, name in zip(paths, names, strict=True)]
@@ -53,8 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         common.deliver(
             lambda: common.print_document(present.comparison(comparison), notes),
-            (arguments.json, lambda path: common.write_json(path, comparison_document(comparison))),
-            (arguments.report, lambda path: write_report(path, comparison)),
+            *common.result_files(arguments, comparison),
         )
     except BrokenPipeError:  # the exit code is still valid after | head
         give_up(sys.stdout)

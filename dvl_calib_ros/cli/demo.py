@@ -18,11 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, needing_ros
 from . import common
-from .common import add_report_option, report_writer
 from .watch import node_command
 
 if TYPE_CHECKING:
-    from ..bag_replay.replay import Replayed
     from ..calibration.results.results import Result
 
 BAG = "harbour_box"
@@ -34,7 +32,7 @@ SCALE_PERCENT = 0.5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("--speed", type=float, default=20.0, help="times real time; default: %(default)g")
-    add_report_option(parser)
+    common.add_report_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -42,13 +40,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     Return 0 if both agree, else 1.
     """
+    from ..bag_replay.replay import replay
     from ..calibration.models import MODELS
+    from ..files.parameter_files import load_parameters
+    from ..present.replay import replayed
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
     bag = common.share_folder() / "bags" / BAG
     common.check_outputs(arguments, "report", also_read=[bag])
-    write_report = report_writer(arguments, "write_replay_report")
     os.environ.update(private_domain())
     with needing_ros("demo"):
         import rclpy
@@ -70,11 +70,11 @@ def run(arguments: argparse.Namespace) -> int:
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; its log: {log.read()[-2000:]}")
-        offline = _replay_offline(bag, latency, with_history=arguments.report is not None)
+        offline = replay([bag], load_parameters(None, [latency]), with_history=arguments.report is not None)
         agree = _compare(out, saved, offline.result)
     _show_diagnosis(out, bag)
     if arguments.report is not None:
-        write_report(arguments.report, offline, [bag], list(MODELS))
+        common.write_page(arguments.report, replayed(offline, [bag], list(MODELS)))
         out.print(f"The replay's report is in {arguments.report}.")
     return 0 if agree else 1
 
@@ -117,14 +117,6 @@ def _truth() -> dict[str, float]:
     return angles | {"delta_k": 100.0 * scale[0]}
 
 
-def _replay_offline(bag: Path, latency: str, with_history: bool) -> Replayed:
-    """Replay the bag with the node's latency."""
-    from ..bag_replay.replay import replay
-    from ..files.parameter_files import load_parameters
-
-    return replay([bag], load_parameters(None, [latency]), with_history=with_history)
-
-
 def _compare(out: Any, saved: Path, offline: Result) -> bool:
     """Print live and replayed estimates; return whether they agree to rounding."""
     import numpy as np
@@ -132,7 +124,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     from ..disk.text_files import load_yaml
     from ..files.result_file import load_result
     from ..present.document import Table
-    from ..present.error_terms import estimate_table
+    from ..present.replay import estimate_table
     from ..present.terminal import rich_table
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`")

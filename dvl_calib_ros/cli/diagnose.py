@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from . import common
-from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -46,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the diagnosis with N draws of calibration and effects from their posterior, for export --sample",
     )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="print all tables as well")
-    add_report_option(parser)
+    common.add_report_option(parser)
     common.add_discovery_options(parser)
     add_simulator_arguments(parser)
 
@@ -58,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_without(arguments)
     from ..diagnosis.answer.compensation import parameter_file, verified_corrections
     from ..diagnosis.answer.posterior_samples import with_samples
-    from ..diagnosis.answer.results import DiagnosisVerdict, diagnosis_document
+    from ..diagnosis.answer.results import DiagnosisVerdict
     from ..diagnosis.answer.simulated_twin import write_twins
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.model.recorded_streams import recording_names
@@ -81,7 +80,6 @@ def run(arguments: argparse.Namespace) -> int:
         | ({} if sampled is None else {"--samples": sampled}),
     )
     _check_twins(arguments.twin, names)
-    write_report = report_writer(arguments)
     recording = common.opened(arguments.bags, parameters)
     discovery = common.discovered(arguments, recording, parameters)
     parameters = discovery.diagnosed
@@ -126,11 +124,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     common.deliver(
         answer,
-        (arguments.json, lambda path: common.write_json(path, diagnosis_document(diagnosis))),
+        *common.result_files(arguments, diagnosis),
         (sampled, lambda path: common.write_json(path, with_samples(diagnosis, count))),
         (arguments.apply, apply),
         (arguments.twin, write_all_twins),
-        (arguments.report, lambda path: write_report(path, diagnosis)),
     )
     cannot = diagnosis.verdict in (DiagnosisVerdict.UNKNOWN, DiagnosisVerdict.INSUFFICIENT_EXCITATION)
     return int(cannot or diagnosis.reasons[0].severity is Severity.REJECT)
@@ -201,33 +198,27 @@ def check_without(arguments: argparse.Namespace) -> None:
 def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> int:
     """Compare, print, save. Return 1 if the recordings cannot answer."""
     from ..present.result_documents import DOCUMENTS
-    from ..unpaired.results import SimulatorVerdict, unpaired_document
-    from ..unpaired.simulator_rounds import ClosedGap, against, check_rounds, closed_gap_document
+    from ..unpaired.results import SimulatorVerdict
+    from ..unpaired.simulator_rounds import against, check_rounds
 
     for option in NOT_WITH:
         if getattr(arguments, option) is not None:
             raise InputError(f"--{option} works only without --simulator")
     check_rounds(arguments.rounds, arguments.keep)
     common.check_outputs(arguments, "json", "report", folders=["keep"])
-    write_report = report_writer(arguments)
     real = _open_side(arguments, arguments.bags, arguments.params, defaults)
     sim = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
     with common.progress("comparing") as on_progress:
         found = against(
             real[0], sim[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
         )
-    document = closed_gap_document(found) if isinstance(found, ClosedGap) else unpaired_document(found)
 
     def answer() -> None:
         common.print_document(DOCUMENTS[type(found)](found), [*real[1].doubts, *sim[1].doubts])
         common.print_found(real[1], arguments.bags)
         common.print_found(sim[1], arguments.simulator)
 
-    common.deliver(
-        answer,
-        (arguments.json, lambda path: common.write_json(path, document)),
-        (arguments.report, lambda path: write_report(path, found)),
-    )
+    common.deliver(answer, *common.result_files(arguments, found))
     return int(found.verdict is SimulatorVerdict.CANNOT_TELL)
 
 

@@ -18,7 +18,6 @@ from tempfile import TemporaryDirectory
 from ..errors import InputError
 from ..standard_streams import say
 from . import common
-from .common import add_report_option, report_writer
 
 LIVE_S = 20.0
 # interval of the search for new topics, s
@@ -33,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="examine the current ROS 2 topics for S seconds, not a bag; without a number: %(const)g",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
-    add_report_option(parser)
+    common.add_report_option(parser)
     common.add_discovery_options(parser)
 
 
@@ -44,15 +43,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     _check_arguments(arguments)
     common.check_outputs(arguments, "json", "report")
-    write_report = report_writer(arguments)
     parameters = common.load(arguments)
     with _recordings(arguments) as bags:
         examination = examine(common.opened(bags, parameters), parameters, common.given(arguments))
     is_live, named = arguments.live is not None, common.options_given(arguments)
     common.deliver(
         lambda: common.print_document(present.examination(examination, is_live, named)),
-        (arguments.json, lambda path: common.write_json(path, examination.document())),
-        (arguments.report, lambda path: write_report(path, examination)),
+        *common.result_files(arguments, examination),
     )
     return int(examination.verdict == "no")
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from . import common
-from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from ..parallel import Workers
@@ -35,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--partial", action="store_true", help="go on although trajectories are missing in the folder")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was found as JSON")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every Avg.VRMSE as CSV, one per line")
-    add_report_option(parser)
+    common.add_report_option(parser)
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
     parser.add_argument("--dask", default="", metavar="ADDRESS", help="scheduler to work on, such as tcp://host:8786")
     common.add_discovery_options(parser)
@@ -45,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Run the evaluation or the cross-check, print its document, and write the requested files."""
     from ..calibration.models import BY_VELOCITY
     from ..disk.atomic import save_text
-    from ..evaluation.documents import evaluation_csv, evaluation_document
+    from ..evaluation.documents import evaluation_csv
     from ..evaluation.protocol import SETS
     from ..evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
     from ..parallel import Workers
@@ -67,7 +66,6 @@ def run(arguments: argparse.Namespace) -> None:
         _cross_check(arguments, models, workers)
         return
     parameters = common.load(arguments, DEFAULTS)
-    write_report = report_writer(arguments)
     with common.progress("evaluating") as on_progress:
         evaluation = evaluate(
             arguments.paths[0] if arguments.paths else None,
@@ -81,9 +79,8 @@ def run(arguments: argparse.Namespace) -> None:
         )
     common.deliver(
         lambda: common.print_document(present.evaluation(evaluation)),
-        (arguments.json, lambda path: common.write_json(path, evaluation_document(evaluation))),
+        *common.result_files(arguments, evaluation),
         (arguments.csv, lambda path: save_text(path, evaluation_csv(evaluation))),
-        (arguments.report, lambda path: write_report(path, evaluation)),
     )
 
 
@@ -103,18 +100,16 @@ def _are_bags(paths: list[Path]) -> bool:
 
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
     """Check each bag's calibration on the other bags; print and save."""
-    from ..evaluation.cross_check import cross_check, cross_check_document
+    from ..evaluation.cross_check import cross_check
     from ..present import evaluation as present
 
     if arguments.csv is not None:
         raise InputError("--csv: only for a folder of trajectories; for bags there is --json")
-    write_report = report_writer(arguments)
     with common.progress("replaying") as on_progress:
         check = cross_check(
             arguments.paths, common.load(arguments), models, common.given(arguments), workers, on_progress
         )
     common.deliver(
         lambda: common.print_document(present.cross_check(check)),
-        (arguments.json, lambda path: common.write_json(path, cross_check_document(check))),
-        (arguments.report, lambda path: write_report(path, check)),
+        *common.result_files(arguments, check),
     )

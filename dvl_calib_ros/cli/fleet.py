@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Calibrate new and changed recordings, write the page, print."""
     from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
-    from ..present.fleet import fleet as present
+    from ..present.comparison import fleet as present
     from ..present.page import write_report
 
     if arguments.jobs < 0:

@@ -44,36 +44,33 @@ def run(arguments: argparse.Namespace) -> None:
     """Print the requested table."""
     if arguments.joint is not None and arguments.urdf is None:
         raise InputError("--joint needs --urdf")
+    show(*_table(arguments).splitlines())
+
+
+def _table(arguments: argparse.Namespace) -> str:
+    """Return the requested table; import only what it needs."""
     if arguments.effects:
         from ..effects.registry import effect_table
 
-        show(*effect_table().splitlines())
-        return
+        return effect_table()
     if arguments.drivers:
         from ..messages.drivers import driver_table
 
-        show(*driver_table().splitlines())
-        return
+        return driver_table()
     if arguments.commands:
-        show(*command_table().splitlines())
-        return
+        return command_table()
     if table := next((name for name in _TABLES if getattr(arguments, name)), None):
         from ..verdict.reasons import TABLES, lookup
 
-        show(*lookup(TABLES[table]).splitlines())
-        return
+        return lookup(TABLES[table])
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters
         from ..files.urdf import read_urdf
 
-        show(
-            *urdf_parameters(read_urdf(arguments.urdf), arguments.base_frame, "dvl_link", arguments.joint).splitlines()
-        )
-        return
+        return urdf_parameters(read_urdf(arguments.urdf), arguments.base_frame, "dvl_link", arguments.joint)
     from ..files.parameter_files import model_table, parameter_file_text, parameter_table
 
-    make = parameter_file_text if arguments.yaml else model_table if arguments.models else parameter_table
-    show(*make().splitlines())
+    return (parameter_file_text if arguments.yaml else model_table if arguments.models else parameter_table)()
 
 
 def command_table() -> str:

@@ -14,6 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from ..standard_streams import say, show
 from . import common
 
@@ -55,7 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Play until the end, or until Ctrl-C. Raises InputError."""
     from ..bags.reader import BagReader
-    from ..errors import InputError
 
     _check_arguments(arguments)
     start, duration = arguments.start_offset, arguments.playback_duration
@@ -108,8 +108,6 @@ def _wait_for_subscribers(player: BagPlayer, has_ended: Callable[[], bool]) -> N
 
 def _check_arguments(arguments: argparse.Namespace) -> None:
     """Raise InputError for an option outside its range."""
-    from ..errors import InputError
-
     for name, (low, high) in (("rate", RATES), ("clock", CLOCKS_HZ)):
         value = getattr(arguments, name)
         if value and not low <= value <= high:
@@ -138,7 +136,6 @@ def _description(bag: BagReader, static: Sequence[str], played: Mapping[str, str
 
 def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Map topics to published names; list static transforms that cannot be published. Raises InputError."""
-    from ..errors import InputError
     from ..node.message_types import message_class
     from ..recordings.recording import is_static
     from ..recordings.topics import spelled

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from . import common
-from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from ..bag_replay.replay import Replayed
@@ -31,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-v", "--verbose", action="store_true", help="show counts, selection and all models as well")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")
-    add_report_option(parser)
+    common.add_report_option(parser)
     common.add_discovery_options(parser)
 
 
@@ -41,13 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
     from ..calibration.models import MODELS
     from ..examination.examine import judged_replay
     from ..files.result_file import result_document, save_result
+    from ..present.replay import replayed as document_of
     from ..verdict.kinds import Severity
 
     extra = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
     models = list(MODELS) if arguments.verbose or not extra else extra
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "save", "report")
-    write_report = report_writer(arguments, "write_replay_report")
     recording = common.opened(arguments.bags, parameters)
     discovery = common.discovered(arguments, recording, parameters)
     with common.progress("replaying") as on_progress:
@@ -73,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
         lambda: _print(arguments, replayed, discovery, models if arguments.verbose else extra),
         (arguments.json, write),
         (arguments.save, save),
-        (arguments.report, lambda path: write_report(path, replayed, arguments.bags, models)),
+        (arguments.report, lambda path: common.write_page(path, document_of(replayed, arguments.bags, models))),
     )
     verification = result.verifications.get(result.selected)
     return int(verification is not None and verification.verdict is Severity.REJECT)

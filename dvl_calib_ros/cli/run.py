@@ -37,17 +37,15 @@ def run(arguments: argparse.Namespace) -> int:
 def ros_arguments(arguments: argparse.Namespace) -> list[str]:
     """Return the options as ROS 2 arguments."""
     from ..files.parameter_files import ros_override
+    from ..recordings.topics import Topics
 
     ros = ["--ros-args"]
     if arguments.params is not None:
         ros += ["--params-file", str(Path(arguments.params).resolve())]
     for override in arguments.overrides:
         ros += ["-p", ros_override(override)]
-    for default, topic in (
-        ("dvl/twist", arguments.dvl_topic),
-        ("gnss/twist", arguments.gnss_topic),
-        ("imu/data", arguments.imu_topic),
-    ):
+    for role, default in vars(Topics()).items():
+        topic = getattr(arguments, f"{role}_topic")
         if topic != default:
             ros += ["-r", f"{default}:={topic}"]
     return ros + list(arguments.ros_args)

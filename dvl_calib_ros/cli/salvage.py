@@ -18,8 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Read everything, write it, report the losses."""
-    from ..bags.recover import recover
-    from ..bags.writer import Compression, Storage
+    from ..bags.writer import Compression, Storage, recover
     from ..present.numbers import counted
 
     common.check_outputs(arguments, folders=["output"])

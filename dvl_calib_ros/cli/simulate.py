@@ -168,9 +168,7 @@ def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace,
             raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} sets it as well; omit one of the two")
     description = load_description(arguments.diagnosis)
     scenario, left_out = with_dvl(scenario, description)
-    notes = [
-        f"the data could not distinguish {', '.join(names)}; {names[0]} is used" for names in description.ambiguous
-    ]
+    notes = [*description.ambiguities]
     if left_out:
         notes.append(f"not simulated (of unknown size, or of another day): {', '.join(left_out)}")
     common.print_warnings([f"{arguments.diagnosis}: {note}" for note in notes])

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, NamedTuple
 
-from ..errors import printable
+from ..errors import needing_ros, printable
 from ..node.main import ENDS_WITH_STDIN
 from ..standard_streams import say
 from . import common
@@ -53,8 +53,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _listener(node: str) -> Listener:
     """Return a listener to a node's diagnostics. Raises InputError without ROS."""
-    from ..errors import needing_ros
-
     with needing_ros("watch"):
         import rich  # noqa: F401
 
@@ -280,12 +278,17 @@ def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
     yield Row(_heading_bars(status))
 
 
+def _parsed(text: str) -> float:
+    """Parse a number of another process; nan if invalid."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def _duration(text: str, rough: bool = False) -> str:
     """Format seconds of another process. rough: without seconds from two minutes on."""
-    try:
-        seconds = float(text)
-    except ValueError:
-        return text
+    seconds = _parsed(text)
     if not math.isfinite(seconds):
         return text
     if rough and seconds >= 120.0:
@@ -294,11 +297,8 @@ def _duration(text: str, rough: bool = False) -> str:
 
 
 def _number(text: str) -> float:
-    """Parse a number of another process; 0 if invalid."""
-    try:
-        number = float(text)
-    except ValueError:
-        return 0.0
+    """Parse a positive number of another process; 0 if invalid."""
+    number = _parsed(text)
     return number if 0.0 < number < 1e9 else 0.0
 
 

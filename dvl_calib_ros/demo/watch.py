@@ -15,14 +15,13 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rich.console import Group
 from rich.table import Table
 
 from ..calibration.results.results import NOT_ESTIMATED
 from ..files.parameter_files import NODE_NAME
 from ..node.calibration_node import QUEUE
-from ..node.services import AnsweringNode
+from ..node.services import LATCHED, AnsweringNode
 from ..recordings.topics import Topics
 from .player import BagPlayer
 
@@ -48,10 +47,7 @@ class Watcher:
         """Subscribe to the answers of the node, and create the publishers of the bags."""
         self._truth = truth
         self._node = AnsweringNode("dvl_calib_demo")
-        latched = QoSProfile(
-            depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-        )
-        self._node.create_subscription(TwistWithCovarianceStamped, f"{NODE_NAME}/estimate", self._on_estimate, latched)
+        self._node.create_subscription(TwistWithCovarianceStamped, f"{NODE_NAME}/estimate", self._on_estimate, LATCHED)
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self._parameters = AsyncParameterClient(self._node, NODE_NAME)
         self._player = BagPlayer(self._node, paths)

@@ -166,11 +166,7 @@ class _Search:
 
     def _checked(self, role: str, name: str | None) -> str | None:
         """Return a named topic if the recording has it with a usable type. Raises InputError."""
-        if name is None:
-            return None
-        return topic_choice.checked_topic(
-            f"--{role}-topic", name, topic_choice.wanted_types(role), self._survey, self._where
-        )
+        return None if name is None else topic_choice.checked_topic(role, name, self._survey, self._where)
 
     def _describe_topics(self, topics: Topics) -> str:
         """Describe the chosen topics with type, frame and rate, for the first line of the output."""

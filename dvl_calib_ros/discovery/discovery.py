@@ -82,9 +82,8 @@ class Discovery:
 
     def document(self) -> dict[str, Any]:
         """Return plain data for JSON: topics, findings, warnings."""
-        topics = {"dvl": self.topics.dvl, "gnss": self.topics.gnss, "imu": self.topics.imu}
         return {
-            "topics": topics,
+            "topics": dict(vars(self.topics)),
             "found": list(self.found),
             "doubts": list(self.doubts),
             "contradictions": [contradiction.as_dict() for contradiction in self.contradictions],

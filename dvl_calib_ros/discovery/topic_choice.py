@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from ..messages.drivers import DVL_TYPES, IMU_TYPE, POSE_TYPES, REFERENCE_TYPES, TWIST_TYPE
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, POSE_TYPES, REFERENCE_TYPES, TWIST_TYPE, WANTED_TYPES
 from ..recordings.topics import ORIENTATION, spelled
 from ..verdict.reasons import Reason, finding
 
@@ -62,13 +62,12 @@ def is_derived(preview: Preview) -> bool:
     return _has(preview, (*DERIVED_WORDS, *COMMAND_WORDS))
 
 
-def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, where: str) -> str:
+def checked_topic(role: str, name: str, survey: Survey, where: str) -> str:
     """Return a named topic as spelled in the recording. Raises InputError if it is missing or of another type."""
-    present = survey.topics
+    option, wanted, present = f"--{role}-topic", WANTED_TYPES[role], survey.topics
     spelled_topic = spelled(name, present)
-    wanted = set(kinds)
     if spelled_topic is not None and present[spelled_topic] not in wanted:
-        expected = " or ".join(kinds)
+        expected = " or ".join(wanted)
         fields = f"; set {option}"
         if option == "--dvl-topic" and spelled_topic in survey.field_maps:
             fields = f"; read it with --dvl-fields {survey.field_maps[spelled_topic]}"
@@ -196,8 +195,3 @@ def _listing(survey: Survey) -> str:
     unread = {name: f", which cannot be decoded: {why}" for name, why in survey.unread.items()}
     held = ", ".join(f"{name} ({kind}{unread.get(name, '')})" for name, kind in sorted(survey.topics.items()))
     return f"The bag has: {held}" if held else "The bag is empty"
-
-
-def wanted_types(role: str) -> Sequence[str]:
-    """Return the message types that a role's topic may have."""
-    return {"dvl": list(DVL_TYPES), "gnss": list(REFERENCE_TYPES), "imu": [IMU_TYPE]}[role]

@@ -187,12 +187,6 @@ class Placement(NamedTuple):
     said: str
 
 
-def not_default(parameters: Parameters) -> frozenset[str]:
-    """Return the names of parameters with another value than the default."""
-    default = Parameters()
-    return frozenset(name for name in default.as_dict() if getattr(parameters, name) != getattr(default, name))
-
-
 def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Collection[str]) -> Placement | None:
     """Return mounting_rpy, lever_arm and imu_rpy from transforms, unless given; None if they do not place the DVL."""
     placed = tree.placed(frames.dvl, parameters.base_frame)

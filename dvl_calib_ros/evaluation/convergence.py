@@ -49,11 +49,10 @@ def squared_errors(
     failures: receives exceptions.
     """
     ends = [run.first(seconds) for seconds in TIMES_S]
-    cut = slice(0, ends[-1])
     truth = protocol.truth()[:, :3]
     by_key: dict[tuple[str, float | None], Array] = {}
     for std, reference in references.items():
-        data = SensorData(run.part(0, ends[-1]), measured[:, cut], reference[:, cut])
+        data = SensorData(run, measured, reference).part(0, ends[-1])
         aided = [name for name in _AIDED if name in models]
         free = [name for name in _FREE if name in models] if std == REFERENCE_STD[0] else []
         states = estimate([*aided, *free], data, parameters.replace(gnss_aided_std=std), ends, failures)

@@ -49,6 +49,10 @@ class SensorData:
     velocity_dvl: Array
     reference: Array
 
+    def part(self, start: int, end: int) -> SensorData:
+        """Return the samples start .. end - 1."""
+        return SensorData(self.run.part(start, end), self.velocity_dvl[:, start:end], self.reference[:, start:end])
+
 
 @dataclass(frozen=True)
 class AlignedVariants:
@@ -189,9 +193,8 @@ def _estimate_fed(name: str, data: SensorData, parameters: Parameters, ends: Seq
         calibrator = Calibrator(parameters, prior_sway_heave=prior, block_size=max(ends), models=(name,))
         found = []
         for start, end in pairwise((0, *ends)):
-            part = SensorData(data.run.part(start, end), data.velocity_dvl[:, start:end], data.reference[:, start:end])
             if end > start:
-                calibrator.feed(streams_of(part, variant))
+                calibrator.feed(streams_of(data.part(start, end), variant))
             found.append(calibrator.result().estimates[name])
         x.append([each.state for each in found])
         p.append([each.recording_covariance for each in found])

@@ -80,7 +80,7 @@ class RunOutcome:
 class SeedOutcome:
     """Result of one seed. by_set: one per set, E are the windows of `protocol.WINDOWS_S`.
 
-    each, single_heading: one per run of `each_runs` and `single_headings`.
+    each, single_heading: one per stretch of `whole_runs` and `single_headings`.
     baselines: (S, K) Avg.VRMSE of `baselines.BASELINES`.
     convergence: (L, curves, T, 3) squared errors of the misalignment over time on each run, see `convergence`.
     failures: exceptions, whose results are nan.
@@ -127,31 +127,23 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     if not procedure.studies:
         none = np.empty((0, len(curve_keys(procedure.studied)), len(TIMES_S), 3))
         return SeedOutcome(by_set, (), (), baselines, none, _of_seed(failures, seed))
-    with_attitude = runs_with_attitude(procedure.runs)
-    legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
-    outcome_of_seed = SeedOutcome(
-        by_set=by_set,
-        each=tuple(outcome(procedure.studied, data(name), [None], None) for name in with_attitude),
-        single_heading=tuple(
-            outcome(procedure.studied, _part_of_data(data(name), start, end), [None], None) for name, start, end in legs
-        ),
-        baselines=baselines,
-        convergence=np.stack(
-            [
-                squared_errors(
-                    procedure.runs[name],
-                    measured[name],
-                    {std: references(procedure.runs[name], seed, std) for std in REFERENCE_STD},
-                    procedure.studied,
-                    procedure.parameters,
-                    failures,
-                )
-                for name in with_attitude
-            ]
-            or [np.full((len(curve_keys(procedure.studied)), len(TIMES_S), 3), np.nan)]
-        ),
+    each, single_heading = (
+        tuple(outcome(procedure.studied, data(name).part(start, end), [None], None) for name, start, end in stretches)
+        for stretches in (whole_runs(procedure.runs), single_headings(procedure.runs))
     )
-    return replace(outcome_of_seed, failures=_of_seed(failures, seed))
+    squares = [
+        squared_errors(
+            procedure.runs[name],
+            measured[name],
+            {std: references(procedure.runs[name], seed, std) for std in REFERENCE_STD},
+            procedure.studied,
+            procedure.parameters,
+            failures,
+        )
+        for name, *_ in whole_runs(procedure.runs)
+    ]
+    convergence = np.stack(squares or [np.full((len(curve_keys(procedure.studied)), len(TIMES_S), 3), np.nan)])
+    return SeedOutcome(by_set, each, single_heading, baselines, convergence, _of_seed(failures, seed))
 
 
 def seed_or_failure(procedure: Procedure, seed: int) -> SeedOutcome | Failure:
@@ -208,10 +200,6 @@ def references(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) 
     )
 
 
-def _part_of_data(data: SensorData, start: int, end: int) -> SensorData:
-    return SensorData(data.run.part(start, end), data.velocity_dvl[:, start:end], data.reference[:, start:end])
-
-
 def corrections(model: Model, state: GaussianState) -> Array:
     """Return correction matrices (..., 3, 3) of states x (..., n)."""
     terms = state.x @ model.error_terms_from_state.T
@@ -254,20 +242,18 @@ def _calibrate_once(
     return RunOutcome(by_time, by_time[own], errors, std, yaw_observed)
 
 
-def runs_with_attitude(runs: Mapping[str, Trajectory]) -> list[str]:
-    """Return the names of the trajectories with attitude."""
-    return [name for name, run in runs.items() if run.rotation_enu_from_body is not None]
+Stretch = tuple[str, int, int]
+"""A trajectory's name, the first sample of a part of it, and the one after the last."""
 
 
-def each_runs(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
-    """Return the calibration runs of `SeedOutcome.each`."""
-    return tuple(_calibration_run(runs[name], 0, len(runs[name].time)) for name in runs_with_attitude(runs))
+def whole_runs(runs: Mapping[str, Trajectory]) -> list[Stretch]:
+    """Return all trajectories with attitude."""
+    return [(name, 0, len(run.time)) for name, run in runs.items() if run.rotation_enu_from_body is not None]
 
 
-def single_headings(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
-    """Return the calibration runs of `SeedOutcome.single_heading`."""
-    legs = [leg for name in runs_with_attitude(runs) for leg in _legs(runs[name])]
-    return tuple(_calibration_run(runs[name], start, end) for name, start, end in legs)
+def single_headings(runs: Mapping[str, Trajectory]) -> list[Stretch]:
+    """Return the stretches of one heading of these trajectories."""
+    return [leg for name, *_ in whole_runs(runs) for leg in _legs(runs[name])]
 
 
 def _calibration_run(run: Trajectory, start: int, end: int) -> CalibrationRun:
@@ -278,8 +264,8 @@ def _calibration_run(run: Trajectory, start: int, end: int) -> CalibrationRun:
     return CalibrationRun(run.name, from_s, to_s, heading_spread(rotation[start:end]))
 
 
-def _legs(run: Trajectory) -> list[tuple[str, int, int]]:
-    """Return stretches (name, start, end) on one heading, greedily from the start."""
+def _legs(run: Trajectory) -> list[Stretch]:
+    """Return stretches on one heading, greedily from the start."""
     rotation = run.rotation_enu_from_body
     assert rotation is not None
     heading = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
@@ -370,7 +356,7 @@ def evaluate(
         published=protocol.PUBLISHED,
         coverage=_coverage(procedure.models, [run for each in outcomes for run in each.by_set]),
         coverage_of_all=_coverage(procedure.models, [run for each in outcomes for run in (*each.by_set, *each.each)]),
-        each=_each_study(procedure, each_runs(runs), [each.each for each in outcomes]),
+        each=_each_study(procedure, whole_runs(runs), [each.each for each in outcomes]),
         single_heading=_each_study(procedure, single_headings(runs), [each.single_heading for each in outcomes]),
         parameters=parameters.as_dict(),
         version=__version__,
@@ -415,13 +401,13 @@ def _coverage(models: Sequence[str], outcomes: Sequence[RunOutcome]) -> tuple[Co
 
 
 def _each_study(
-    procedure: Procedure, runs: tuple[CalibrationRun, ...], outcomes: Sequence[Sequence[RunOutcome]]
+    procedure: Procedure, stretches: Sequence[Stretch], outcomes: Sequence[Sequence[RunOutcome]]
 ) -> EachStudy | None:
-    """Summarise a study. outcomes: per seed, one per run."""
-    if not runs:
+    """Summarise a study of calibrations on each stretch. outcomes: per seed, one per stretch."""
+    if not stretches:
         return None
     return EachStudy(
-        runs=runs,
+        runs=tuple(_calibration_run(procedure.runs[name], start, end) for name, start, end in stretches),
         avg_vrmse=np.stack([[run.avg_vrmse for run in seed] for seed in outcomes], axis=-1),
         yaw_observed=mean_of_known(np.array([[run.yaw_observed for run in seed] for seed in outcomes]), 0),
         coverage=_coverage(procedure.models, [run for seed in outcomes for run in seed]),
@@ -451,7 +437,7 @@ def _calibrate(data: SensorData, end: int, procedure: Procedure, failures: list[
     """Calibrate every `VERIFIED` combination on the first `end` samples, without those that raise."""
     parameters = procedure.parameters
     prior = true_prior(data, parameters)
-    stretch = SensorData(data.run.part(0, end), data.velocity_dvl[:, :end], data.reference[:, :end])
+    stretch = data.part(0, end)
     results = []
     for variant in range(len(data.velocity_dvl))[VERIFIED]:
         try:

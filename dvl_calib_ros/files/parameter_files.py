@@ -322,7 +322,6 @@ def _insertion(text: str, section: Any, values: Mapping[str, str]) -> tuple[int,
 
 def new_file(parameters: Parameters, changed: Mapping[str, Any], says: str) -> bytes:
     """Return a parameter file with the values that are not defaults. says: text of its first line, a comment."""
-    default = Parameters().as_dict()
-    values = {key: value for key, value in parameters.replace(**changed).as_dict().items() if value != default[key]}
+    values = changed_parameters(parameters.replace(**changed))
     lines = [f"# {says}", "/**:", "  ros__parameters:"]
     return "\n".join([*lines, *(f"    {key}: {as_yaml(value)}" for key, value in values.items()), ""]).encode()

@@ -332,7 +332,8 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
     extrinsics_row = None
     if extrinsics is not None and without_day is not None:
         extrinsics_row = {**_plain_data(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
-        extrinsics_row |= _cause(replayed)
+        if replayed.cause_of_scale is not None:
+            extrinsics_row["cause_of_scale"] = replayed.cause_of_scale.sentence
     rows = (*_quantities(result), *_heading(estimate), *_water(replayed.water))
     return Entry([common | row for row in rows], extrinsics_row)
 
@@ -398,12 +399,6 @@ def _water(water: Water | None) -> list[Row]:
         for name, unit, value, twice in known
         if not math.isnan(value)
     ]
-
-
-def _cause(replayed: Replayed) -> dict[str, str]:
-    """Return the scale's explanation by the water, under its name in the catalogue."""
-    cause = replayed.cause_of_scale
-    return {} if cause is None else {"cause_of_scale": cause.sentence}
 
 
 def _without_day(replayed: Replayed) -> Replayed:

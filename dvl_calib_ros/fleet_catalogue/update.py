@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ..calibration.comparison.mounting_change import ANSWERS
 from ..calibration.models.parameters import Parameters
 from ..discovery.discovery import Given
 from ..disk.atomic import check_folder_writable, save_bytes
@@ -132,19 +133,15 @@ class Catalogue:
 
     def rows_of(self, recording: str) -> list[Row]:
         """Return the rows of a recording. Raises InputError if its part is damaged."""
-        from pyarrow import parquet
-
         content = self._read_checked(self._path(recording))
-        found: list[Row] = parquet.read_table(self._arrow.BufferReader(content)).to_pylist()
+        found: list[Row] = self._arrow.parquet.read_table(self._arrow.BufferReader(content)).to_pylist()
         return found
 
     def _read_part(self, path: Path) -> CataloguePart:
         """Read a file's own description. Raises InputError if it is no part, damaged, or misnamed."""
-        from pyarrow import parquet
-
         content = self._read_checked(path)
         try:
-            metadata = json.loads(parquet.read_schema(self._arrow.BufferReader(content)).metadata[_KEY])
+            metadata = json.loads(self._arrow.parquet.read_schema(self._arrow.BufferReader(content)).metadata[_KEY])
             part = CataloguePart(**metadata)
         except (OSError, KeyError, TypeError, ValueError, self._arrow.ArrowException) as error:
             raise InputError(f"{path}: was not written by this version of dvl-calib fleet") from error
@@ -180,13 +177,11 @@ class Catalogue:
 
     def _save(self, part: CataloguePart, rows: list[Row]) -> None:
         """Write the rows of a recording as a Parquet file with its checksum."""
-        from pyarrow import parquet
-
         rows = [{name: as_cell(value) for name, value in row.items()} for row in rows]
         metadata = {_KEY: json.dumps(vars(part)), _CHECKSUM_KEY: _CHECKSUM + _ZEROS}
         table = self._arrow.Table.from_pylist(rows, schema=self._schema.with_metadata(metadata))
         sink = self._arrow.BufferOutputStream()
-        parquet.write_table(table, sink, write_page_checksum=True)  # for other readers
+        self._arrow.parquet.write_table(table, sink, write_page_checksum=True)  # for other readers
         content = _with_checksum(sink.getvalue().to_pybytes())
         save_bytes(self._path(part.recording), content, keep=lambda _: [])
 
@@ -208,14 +203,10 @@ def _stamped(row: Row) -> Row:
 def _arrow() -> Any:
     """Return pyarrow. Raises InputError if it is not installed."""
     try:
-        import pyarrow
+        import pyarrow.parquet
     except ImportError as error:
         raise InputError(f"fleet needs pyarrow ({error}); pip install 'dvl_calib_ros[fleet]'") from error
     return pyarrow
-
-
-# answers of a comparison, the worst first
-WORDS = ("moved", "suspicious", "same")
 
 
 @dataclass(frozen=True, repr=False)
@@ -260,7 +251,7 @@ class Fleet(Answering):
     def word(self) -> str:
         """The answer: whether any mounting moved."""
         words = [vehicle.compared.word for vehicle in self.vehicles if vehicle.compared is not None]
-        return next((word for word in WORDS if word in words), "not compared")
+        return next((word for word in reversed(ANSWERS) if word in words), "not compared")
 
 
 def run_fleet(

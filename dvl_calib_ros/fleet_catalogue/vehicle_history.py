@@ -127,20 +127,12 @@ def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[Need
     unique, doubled = [], []
     for entry in entries:
         fit = entry.extrinsics
-        key = (
-            entry.recording
-            if fit is None
-            else (fit.model, fit.first_ns, fit.last_ns, fit.used, fit.covariance.tobytes())
-        )
+        key: Any = entry.recording
+        if fit is not None:
+            key = fit.model, fit.first_ns, fit.last_ns, fit.used, fit.covariance.tobytes()
         if key in first:
-            doubled.append(
-                NeedsPerson(
-                    "SAME_DATA",
-                    f"the same data as {first[key].recording}: only that is used",
-                    (entry.recording,),
-                    entry.vehicle,
-                )
-            )
+            why = f"the same data as {first[key].recording}: only that is used"
+            doubled.append(NeedsPerson("SAME_DATA", why, (entry.recording,), entry.vehicle))
         else:
             first[key] = entry
             unique.append(entry)
@@ -232,13 +224,12 @@ def _water(entries: Sequence[Catalogued]) -> WaterOfRecording | None:
 
 def _heading(entries: Sequence[Catalogued]) -> CompassDeviation | None:
     """Return the weighted mean over all recordings; None if no heading was compared."""
-    names = HEADING_ERRORS[:4]
     values, stds = [], []
     for entry in entries:
         by_parameter = {row["parameter"]: row for row in entry.rows}
-        if all(name in by_parameter for name in names):
-            values.append([by_parameter[name]["value"] for name in names])
-            stds.append([by_parameter[name]["std_recording"] for name in names])
+        if all(name in by_parameter for name in HEADING_ERRORS):
+            values.append([by_parameter[name]["value"] for name in HEADING_ERRORS])
+            stds.append([by_parameter[name]["std_recording"] for name in HEADING_ERRORS])
     if not values:
         return None
     weight = 1.0 / np.square(stds)

@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,13 +21,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..bags.writer import BagWriter, Compression, Storage
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array, over_ground
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, Vector, over_ground
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SampleWriter, SatelliteFix
 from .dvl_log import DvlLog, imu_samples
 from .dvl_logs import is_dvl_log, read_dvl_log
-from .pd0_nmea import KNOT
+from .pd0_nmea import KNOT, is_nmea, read_rmc
 
 # Columns of numbers and stamps in CSV files.
 
@@ -180,27 +180,31 @@ def read_dvl(path: Path, start_ns: int, frame: str, std: float, notes: list[str]
 
     notes: receives remarks on omitted data, here and in the other readers.
     """
-    time, velocity, left_out = read_columns(path, "m/s")
-    notes += left_out
-    covariance = np.eye(3) * std**2 if std else None
-    rows = (velocity @ body_from(frame).T).tolist()
-    return [
-        DvlSample(at, (x, y, z), covariance)
-        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
-    ]
+    return [DvlSample(*each) for each in _velocities(path, start_ns, frame, std, notes)]
 
 
 def read_reference(path: Path, start_ns: int, frame: str, std: float, notes: list[str]) -> list[ReferenceSample]:
     """Read reference velocities, in the body (frame flu, frd) or the earth (enu, ned)."""
+    earth = {"enu": VelocityFrame.ENU, "ned": VelocityFrame.NED}.get(frame, VelocityFrame.BODY)
+    return [ReferenceSample(*each, earth) for each in _velocities(path, start_ns, frame, std, notes)]
+
+
+def _velocities(
+    path: Path, start_ns: int, frame: str, std: float, notes: list[str]
+) -> Iterator[tuple[int, Vector, Array | None]]:
+    """Yield stamp, velocity and covariance of each row, in the body forward-left-up."""
     time, velocity, left_out = read_columns(path, "m/s")
     notes += left_out
+    return _stamped(path, start_ns, time, velocity @ body_from(frame).T, std)
+
+
+def _stamped(
+    path: Path, start_ns: int, time: Array, velocity: Array, std: float
+) -> Iterator[tuple[int, Vector, Array | None]]:
+    """Yield stamp, velocity and covariance of velocities (N, 3) m/s at times (N,) s."""
     covariance = np.eye(3) * std**2 if std else None
-    earth = {"enu": VelocityFrame.ENU, "ned": VelocityFrame.NED}.get(frame, VelocityFrame.BODY)
-    rows = (velocity @ body_from(frame).T).tolist()
-    return [
-        ReferenceSample(at, (x, y, z), covariance, earth)
-        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
-    ]
+    for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), velocity.tolist(), strict=True):
+        yield at, (x, y, z), covariance
 
 
 def read_attitude(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
@@ -306,8 +310,6 @@ def import_recording(
 
 def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[ReferenceSample]:
     """Read the reference velocities of a file by its kind; none from positions."""
-    from .pd0_nmea import is_nmea, read_rmc
-
     if is_nmea(path):
         return read_rmc(path, options.gnss_std, notes)
     if names_columns(path, "speed", "course"):
@@ -473,22 +475,14 @@ def names_columns(path: Path, *wanted: str) -> bool:
 def read_course(path: Path, start_ns: int, std: float, notes: list[str]) -> list[ReferenceSample]:
     """Read speed m/s and course (from true north, clockwise) as horizontal velocities in ENU. Raises InputError."""
     time, values = _named(path, ("speed", "course"), notes)
-    velocities = over_ground(*values.T).tolist()
-    covariance = np.eye(3) * std**2 if std else None
-    return [
-        ReferenceSample(at, (x, y, z), covariance, VelocityFrame.ENU)
-        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), velocities, strict=True)
-    ]
+    each_velocity = _stamped(path, start_ns, time, over_ground(*values.T), std)
+    return [ReferenceSample(*each, VelocityFrame.ENU) for each in each_velocity]
 
 
 def read_positions(path: Path, start_ns: int, notes: list[str]) -> list[SatelliteFix]:
     """Read latitude and longitude. Raises InputError."""
     time, values = _named(path, ("latitude", "longitude"), notes)
-    rows = np.degrees(values).tolist()
-    return [
-        SatelliteFix(at, latitude, longitude)
-        for at, (latitude, longitude) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
-    ]
+    return [*map(SatelliteFix, stamps_ns(path, time, start_ns), *np.degrees(values).T.tolist())]
 
 
 def read_heading(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:

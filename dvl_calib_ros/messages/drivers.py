@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -469,6 +469,8 @@ KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
 }
 DVL_TYPES = {name: kind for name, kind in VELOCITY_TYPES.items() if kind.is_dvl}
 REFERENCE_TYPES = {name: kind for name, kind in VELOCITY_TYPES.items() if kind.is_reference}
+# allowed message types of a topic, by its role
+WANTED_TYPES: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
 # allowed values of these parameters
 TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": DVL_TYPES, "gnss_type": REFERENCE_TYPES}
 

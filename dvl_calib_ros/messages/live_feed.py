@@ -106,7 +106,7 @@ _CODES = {stream: code for code, stream in enumerate(Stream)}
 
 
 class KeptMessages(RowTable):
-    """All messages so far in order of arrival, or none after more than `MOST`.
+    """All messages so far in order of arrival, or none after more than `MOST`. is_kept: whether it has them.
 
     The memory is allocated at the start, so that a node's memory does not grow with the messages received.
     """
@@ -123,11 +123,11 @@ class KeptMessages(RowTable):
         super().__init__()
         self.reserve(int(FULL * MOST))  # no row is ever dropped, so the whole capacity of MOST rows is used
         self._reasons: list[str] = []
-        self._is_kept = True
+        self.is_kept = True
 
     def add(self, stream: Stream, decoded: Sample | str) -> None:
         """Keep a message's sample, or the reason for its refusal."""
-        if not self._is_kept:
+        if not self.is_kept:
             return
         if self.size == MOST:
             self.forget()
@@ -154,19 +154,14 @@ class KeptMessages(RowTable):
 
     def forget(self) -> None:
         """Stop keeping messages."""
-        self._is_kept = False
+        self.is_kept = False
         self.clear()
         self._move(0)
 
     @property
-    def is_kept(self) -> bool:
-        """Return whether all messages so far are kept."""
-        return self._is_kept
-
-    @property
     def streams(self) -> Streams | None:
         """All messages; None if they are no longer kept."""
-        return Streams(*map(self._block, Stream)) if self._is_kept else None
+        return Streams(*map(self._block, Stream)) if self.is_kept else None
 
     def _block(self, stream: Stream) -> SampleBlock:
         """Return all kept samples of one stream."""

@@ -16,9 +16,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -33,11 +33,11 @@ from ..calibration.numerics.samples import DvlSample, VelocityFrame
 from ..calibration.results.results import Correction, lever_arm, mounting_pose
 from ..calibration.streams.position_velocities import check_model
 from ..discovery.gravity import believed_heading
-from ..discovery.transforms import Frames, not_default, placement
+from ..discovery.transforms import Frames, placement
 from ..disk.atomic import check_writable
 from ..errors import InputError
 from ..files.output_paths import check_outputs
-from ..files.parameter_files import NODE_NAME
+from ..files.parameter_files import NODE_NAME, changed_parameters
 from ..files.result_file import (
     KeptError,
     check_in_folder,
@@ -49,6 +49,7 @@ from ..files.result_file import (
 )
 from ..messages.decode import RESTAMP_ALL, frame_name, heading_variance
 from ..messages.live_feed import MessageFeed
+from ..recordings.topics import Topics
 from ..standard_streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
@@ -59,7 +60,7 @@ from .message_queue import Arrived, in_order_of_arrival, take
 from .message_types import empty_twist, fill_errors, set_stamp, velocity_class
 from .operator_card import Card
 from .ros_parameters import declare_parameters
-from .services import AnsweringNode
+from .services import LATCHED, AnsweringNode
 from .status import status_name
 from .topic_graph import input_problems, output_problems, twin_problems
 from .transforms import MountingOutput, Transforms
@@ -83,8 +84,7 @@ class CalibrationNode(AnsweringNode):
         named = set(self.get_parameters_by_prefix(""))
         parameters = declare_parameters(self, parameter_files)
         self._parameter_files = parameter_files
-        dvl_class = velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields)
-        gnss_class = velocity_class("gnss_type", parameters.gnss_type)
+        classes = _message_classes(parameters)
         self._result_folder = Path(parameters.result_file).absolute().parent if parameters.result_file else Path.cwd()
         self._check_result_file(parameters.result_file)
         initial = None
@@ -99,7 +99,7 @@ class CalibrationNode(AnsweringNode):
         # a saved calibration belongs to the mounting that it was saved with
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
-        self._given = not_default(parameters)
+        self._given = frozenset(changed_parameters(parameters))
         self._awaits_heading_std = "heading_deviation_std" not in self._given
         self._late_clocks, self._gravity = LateClocks(named), GravitySeen()
         # used for every DVL message, and constant at run time
@@ -113,15 +113,9 @@ class CalibrationNode(AnsweringNode):
         self._estimate = empty_twist()
         self._corrected = empty_twist()
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
-        latched = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST,
-            depth=1,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
-        self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
-        self._iac_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", latched)
-        self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", latched)
+        self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", LATCHED)
+        self._iac_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", LATCHED)
+        self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", LATCHED)
         self._mounting = MountingOutput(self, self._mounting_publisher, parameters.publish_tf, self.warn)
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
@@ -135,9 +129,8 @@ class CalibrationNode(AnsweringNode):
         # the node's own name of an input -> the discovered topic
         self._found_names: dict[str, str] = {}
         self._found: list[Reason] = []
-        self._subscribe(dvl_class, "dvl/twist")
-        self._subscribe(gnss_class, "gnss/twist")
-        self._subscribe(Imu, "imu/data")
+        for own, message_type in classes.items():
+            self._subscribe(message_type, own)
         topics = {own: subscription.topic_name for own, subscription in self._inputs.items()}
         _check_distinct(topics | {"~/calibrated_twist": self._corrected_publisher.topic_name})
         now_s = self._pauses.running_s(steady_s())
@@ -160,11 +153,10 @@ class CalibrationNode(AnsweringNode):
 
     def _named_topics(self, *, has_dvl: bool) -> dict[str, str | None]:
         """Return the topics that a search must keep, by role: remapped ones and, next to a DVL, published ones."""
-        roles = {"dvl": "dvl/twist", "gnss": "gnss/twist", "imu": "imu/data"}
-        topics = {role: self._inputs[own].topic_name for role, own in roles.items()}
+        topics = {role: (own, self._inputs[own].topic_name) for role, own in vars(Topics()).items()}
         return {
-            role: topic if roles[role] in self._remapped or (has_dvl and self.count_publishers(topic)) else None
-            for role, topic in topics.items()
+            role: topic if own in self._remapped or (has_dvl and self.count_publishers(topic)) else None
+            for role, (own, topic) in topics.items()
         }
 
     def _discover(self) -> None:
@@ -179,16 +171,16 @@ class CalibrationNode(AnsweringNode):
             searching.close()
             return
         try:
-            found = searching.step(self._named_topics(has_dvl=has_dvl))
+            discovery = searching.step(self._named_topics(has_dvl=has_dvl))
         except InputError as error:
             self.warn(f"{error}; topics are not searched")
             searching.close()
             self._discovering = None
             return
-        if found is None:
+        if discovery is None:
             return
         self._discovering = None
-        discovery, parameters = found
+        parameters = discovery.parameters
         self._found = [] if has_dvl else [finding("TOPICS_FOUND", own=dvl, found=discovery.found[0])]
         for sentence in discovery.found[1:]:
             self.info(sentence)
@@ -196,15 +188,9 @@ class CalibrationNode(AnsweringNode):
             self.warn(str(topics_found))
         for doubt in discovery.doubts:
             self.warn(doubt)
-        topics = discovery.topics
-        names = {"dvl/twist": topics.dvl, "gnss/twist": topics.gnss, "imu/data": topics.imu}
-        present = {name for name, _ in self.get_topic_names_and_types()}
-        self._found_names = {name_used: name for name_used, name in names.items() if name in present}
-        classes = {
-            "dvl/twist": velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields),
-            "gnss/twist": velocity_class("gnss_type", parameters.gnss_type),
-            "imu/data": Imu,
-        }
+        present, classes = dict(self.get_topic_names_and_types()), _message_classes(parameters)
+        names = zip(classes, vars(discovery.topics).values(), strict=True)
+        self._found_names = {name_used: name for name_used, name in names if name in present}
         for name_used in self._found_names:
             old = self._inputs[name_used]
             self._subscribe(classes[name_used], name_used)
@@ -269,42 +255,26 @@ class CalibrationNode(AnsweringNode):
 
     def _log_configuration(self) -> None:
         """Log the model and all parameters that differ from their defaults."""
-        default = Parameters().as_dict()
-        given = self._calibrator.parameters.as_dict()
-        changed = ", ".join(f"{name}: {value}" for name, value in given.items() if value != default[name])
-        self.info(f"model {given['model']}; parameters not at their default: {changed or 'none'}")
+        parameters = self._calibrator.parameters
+        changed = ", ".join(f"{name}: {value}" for name, value in changed_parameters(parameters).items())
+        self.info(f"model {parameters.model}; parameters not at their default: {changed or 'none'}")
 
     # ------------------------------------------------------------------ input
 
     def _subscribe(
         self, message_type: type, topic: str, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE
     ) -> None:
-        """Subscribe reliably, and change to best effort if a best-effort publisher appears.
-
-        A reliable subscription loses nothing but receives nothing from a best-effort publisher; best effort receives
-        from both.
-        """
-
-        def on_incompatible(event: Any) -> None:
-            if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
-                self.info(f"{topic}: a publisher is best effort; subscribing as best effort")
-                assert self.executor is not None  # it runs this callback
-                self.executor.create_task(resubscribe)
+        """Subscribe reliably, and change to best effort if a best-effort publisher appears."""
 
         def resubscribe() -> None:
+            self.info(f"{topic}: a publisher is best effort; subscribing as best effort")
             old = self._inputs[topic]
             self.deliver()  # messages waiting in the old subscription would be lost
             self._subscribe(message_type, topic, ReliabilityPolicy.BEST_EFFORT)
             self.destroy_subscription(old)
 
-        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
-        self._inputs[topic] = self.create_subscription(
-            message_type,
-            self._found_names.get(topic, topic),
-            partial(self._on_message, topic),
-            profile,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False),
-        )
+        name, on_message = self._found_names.get(topic, topic), partial(self._on_message, topic)
+        self._inputs[topic] = self.subscribe(message_type, name, on_message, QUEUE, resubscribe, reliability)
 
     def _on_message(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
         self._deliver({topic: Arrived.of(message, info)})
@@ -591,6 +561,15 @@ class CalibrationNode(AnsweringNode):
             self._discovering.close()
         self._worker.shutdown(cancel_futures=True)
         super().destroy_node()
+
+
+def _message_classes(parameters: Parameters) -> dict[str, type]:
+    """Return the message class of each input, by the node's own name of its topic. Raises InputError."""
+    return {
+        Topics.dvl: velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields),
+        Topics.gnss: velocity_class("gnss_type", parameters.gnss_type),
+        Topics.imu: Imu,
+    }
 
 
 def _check_distinct(topics: Mapping[str, str]) -> None:

@@ -173,7 +173,8 @@ def diagnose(
     # messages sent during a pause are lost here, so they are no dropouts of the DVL
     growth["dvl"]["dropouts"] -= min(growth["dvl"]["dropouts"], len(pauses_s))
     found = [finding("PROCESS_PAUSED", seconds=sum(pauses_s))] if pauses_s else []
-    found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(growth)]
+    found += [*silence.faults(calibrator, counts, now_s).values(), *problems]
+    found += [finding("CLOCK_WENT_BACK")] if growth["calibration"]["restarts"] else []
     found += message_warnings(growth) + recording_warnings(growth) + dvl_type.advice(growth["dvl"])
     found += gate_warnings(estimate) + consistency_warnings(estimate)
     found += reference_warnings(estimate)
@@ -189,7 +190,9 @@ def diagnose(
     if any(problem.code == "REFERENCE_FRAME" for problem in problems):  # the receiver works: its messages are refused
         found = [doubt for doubt in found if not doubt.code.startswith("GNSS_OUTAGE")]
     found.sort(key=lambda each: (each.severity is not Severity.ERROR, each.code not in _CAUSES))
-    status = DiagnosticStatus(level=_status_level(found), hardware_id="dvl")
+    has_error = found and found[0].severity is Severity.ERROR
+    level = DiagnosticStatus.ERROR if has_error else DiagnosticStatus.WARN if found else DiagnosticStatus.OK
+    status = DiagnosticStatus(level=level, hardware_id="dvl")
     status.message = printable("; ".join(map(str, found))) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
@@ -211,16 +214,6 @@ def diagnose(
         values[f"finding {number}"] = str(reason)
     status.values = [KeyValue(key=key, value=printable(str(value))) for key, value in values.items()]
     return status
-
-
-def _status_level(reasons: Sequence[Reason]) -> bytes:
-    if not reasons:
-        return DiagnosticStatus.OK
-    return DiagnosticStatus.ERROR if reasons[0].severity is Severity.ERROR else DiagnosticStatus.WARN
-
-
-def _restart_advice(counts: Counts) -> list[Reason]:
-    return [finding("CLOCK_WENT_BACK")] if counts["calibration"]["restarts"] else []
 
 
 def _estimate_values(estimate: Estimate) -> dict[str, str]:

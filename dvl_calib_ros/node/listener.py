@@ -10,11 +10,10 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-from ..errors import InputError, printable
-from .services import AnsweringNode
+from ..errors import printable
+from .services import AnsweringNode, init_ros
 from .status import Status, status_name
 
 # services of the node
@@ -40,10 +39,7 @@ class Listener:
         self._context = rclpy.Context()
         # without the command's own -p NAME:=VALUE, which ROS takes for a remapping and warns of on the view
         ros_arguments = list(itertools.dropwhile(lambda word: word != "--ros-args", sys.argv))
-        try:
-            rclpy.init(args=ros_arguments, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # rclpy raises its own types for bad --ros-args
-            raise InputError(" ".join(str(error).split())) from error
+        init_ros(ros_arguments, self._context)
         self._node = AnsweringNode("dvl_calib_watch", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)

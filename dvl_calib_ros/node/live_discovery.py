@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NamedTuple
@@ -45,13 +46,6 @@ class _Running(NamedTuple):
     began: float
 
 
-class FoundTopics(NamedTuple):
-    """Discovered topics. parameters: the given ones, with the types of the messages and the recording's findings."""
-
-    discovery: Discovery
-    parameters: Parameters
-
-
 class Discovering:
     """Repeated search, one step per call, until topics and frames are found.
 
@@ -64,10 +58,10 @@ class Discovering:
         self._node, self._parameters, self._worker = node, parameters, worker
         self._given = frozenset(given)
         self._recording: _Running | None = None
-        self._examination: Future[FoundTopics] | None = None
+        self._examination: Future[Discovery] | None = None
         self._said: set[str] = set()
 
-    def step(self, named: Mapping[str, str | None]) -> FoundTopics | None:
+    def step(self, named: Mapping[str, str | None]) -> Discovery | None:
         """Start to record, subscribe to new topics, or examine the recording. Return a result once.
 
         named: topic by role (dvl, gnss, imu), None where it is searched. With a named DVL the frames are searched,
@@ -122,7 +116,7 @@ class Discovering:
         recorder.look()
         self._recording = _Running(folder, recorder, ends, time.monotonic())
 
-    def _outcome(self, looked_through: Future[FoundTopics]) -> FoundTopics | None:
+    def _outcome(self, looked_through: Future[Discovery]) -> Discovery | None:
         """Return the topics found by a finished examination; None while it runs or if it failed."""
         if not looked_through.done():
             return None
@@ -147,8 +141,8 @@ class Discovering:
             ends.close()
             folder.cleanup()
 
-    def _examine(self, folder: TemporaryDirectory[str], path: Path, named: Mapping[str, str | None]) -> FoundTopics:
-        """Examine the recorded bag for topics, frames and mounting. Raises InputError."""
+    def _examine(self, folder: TemporaryDirectory[str], path: Path, named: Mapping[str, str | None]) -> Discovery:
+        """Examine the recorded bag for topics, frames, mounting and types of messages. Raises InputError."""
         from ..discovery.discover import discover
         from ..discovery.discovery import Given
         from ..recordings.recording import open_recording
@@ -165,7 +159,7 @@ class Discovering:
         if named["dvl"] is not None and not (has_turned and "gnss_frame" in found.values):
             raise InputError("the frame of the reference is not observable yet: drive a turn, or set gnss_frame")
         # the node itself subtracts clock offsets once two estimates agree
-        return FoundTopics(found, recording.of_types(found.topics, self._parameters.replace(**found.values)))
+        return replace(found, parameters=recording.of_types(found.topics, self._parameters.replace(**found.values)))
 
 
 def _mean_heading_length(orientation: Array) -> float:

@@ -51,23 +51,20 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     try:
         with needing_ros("the node"):
             import rclpy
-            from rclpy.signals import SignalHandlerOptions
 
             from ..calibration.models.parameters import ParameterError
             from .calibration_node import CalibrationNode
             from .executor import ReceivingExecutor
+            from .services import init_ros
     except InputError as error:
         return _report_refusal(error)
     if ending.requested:
         return 0
-    try:
-        rclpy.init(args=["calibration_node", *args], signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rclpy raises its own types for bad --ros-args and unreadable parameter files
-        return _report_refusal(error)
     node, is_saved = None, True
     give_back_at_once()
     sys.setswitchinterval(GIVES_WAY_S)
     try:
+        init_ros(["calibration_node", *args])
         node = CalibrationNode(parameter_files(args))
         executor = ReceivingExecutor(node)
         gc.freeze()  # objects of the start stay; a collection that examines them would delay a message by 0.01 s

@@ -1,13 +1,29 @@
-"""A node that survives errors in service requests, and logs and answers only what is fit for a terminal."""
+"""Start of ROS 2, and a node that survives errors in service requests and prints only what is fit for a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 
 from ..errors import InputError, printable
+
+# of topics that late subscribers receive, too
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def init_ros(args: list[str], context: rclpy.Context | None = None) -> None:
+    """Initialise ROS 2 without its signal handlers. Raises InputError for arguments that it refuses."""
+    try:
+        rclpy.init(args=args, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy raises its own types for bad --ros-args and unreadable parameter files
+        raise InputError(" ".join(str(error).split())) from error
 
 
 class AnsweringNode(Node):  # type: ignore[misc]
@@ -52,6 +68,25 @@ class AnsweringNode(Node):  # type: ignore[misc]
         """Create a subscription. Raises InputError."""
         make = super().create_subscription
         return _create_or_refuse(topic, lambda: make(msg_type, topic, *arguments, **options))
+
+    def subscribe(
+        self, msg_type: type, topic: str, callback: Callable[..., None], depth: int, on_best_effort: Callable[[], None],
+        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+    ) -> Subscription:  # fmt: skip
+        """Subscribe reliably; on_best_effort must subscribe again once a best-effort publisher appears.
+
+        A reliable subscription loses nothing but receives nothing from a best-effort publisher; best effort receives
+        from both.
+        """
+
+        def on_incompatible(event: Any) -> None:
+            if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
+                assert self.executor is not None  # it runs this callback
+                self.executor.create_task(on_best_effort)
+
+        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability)
+        events = SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False)
+        return self.create_subscription(msg_type, topic, callback, profile, event_callbacks=events)
 
 
 def _printable(response: Any) -> Any:

@@ -11,7 +11,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable
-from types import FrameType, TracebackType
+from types import FrameType
 
 END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Interval of repeated calls to functions that have not ended, s: the middleware may lose a wake-up.
@@ -19,7 +19,7 @@ REPEATED_EVERY_S = 1.0
 
 
 class Ending:
-    """Context manager that records requests to end. Enter it in the main thread as early as possible.
+    """Context manager that notes an end as `requested`. Enter it in the main thread as early as possible.
 
     After a request, further signals are ignored on exit, because the process is about to end; else the previous signal
     handlers are restored.
@@ -31,7 +31,7 @@ class Ending:
 
     def __init__(self, closed: int | None = None) -> None:
         # no threading.Event: setting it takes a lock, on which a signal handler could block itself
-        self._requested = False
+        self.requested = False
         self._functions: list[Callable[[], object]] = []
         self._closed = closed
 
@@ -45,20 +45,13 @@ class Ending:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_IGN if self.requested else handler)
         signal.set_wakeup_fd(self._wakeup_before)
         self._writing.close()
         self._thread.join()
         self._reading.close()
-
-    @property
-    def requested(self) -> bool:
-        """Return whether an end was requested."""
-        return self._requested
 
     def call_on_request(self, function: Callable[[], object]) -> None:
         """Call a function repeatedly, from another thread, from a request until `stop_calling`."""
@@ -71,7 +64,7 @@ class Ending:
         self._functions.clear()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._requested = True
+        self.requested = True
 
     def _watch(self) -> None:
         """Wait for a signal or a closed terminal, then call the registered functions repeatedly until `__exit__`."""
@@ -87,7 +80,7 @@ class Ending:
             if self._closed in ready:
                 watched.remove(self._closed)
             if self._closed in ready or not set(END_SIGNALS).isdisjoint(numbers):
-                self._requested = True
+                self.requested = True
                 self._call()
 
     def _call(self) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,8 @@ import rclpy
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from ..calibration.numerics.frames import rotation_from_quaternion
@@ -29,10 +27,11 @@ from ..errors import InputError
 from ..messages.decode import stamp_ns
 from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES
 from ..messages.encode import FRAME_IDS
+from ..recordings.topics import Topics
 from ..simulation.live_simulation import Follower, MotionSample, Sample, in_order, shifted
 from ..simulation.scenario import START_NS, Scenario, simulate
 from .message_types import fill, message_class, set_stamp
-from .services import AnsweringNode
+from .services import AnsweringNode, init_ros
 from .shutdown import Ending
 
 NODE_NAME = "dvl_simulator"
@@ -44,13 +43,10 @@ BREATH_S = 0.05
 
 
 @dataclass(frozen=True)
-class Outputs:
+class Outputs(Topics):
     """Topics, and the DVL's message type (a name of `messages.drivers`). Raises InputError for an unknown type."""
 
-    dvl: str = "dvl/twist"
-    gnss: str = "gnss/twist"
-    imu: str = "imu/data"
-    dvl_type: str = field(default=TWIST_TYPE)
+    dvl_type: str = TWIST_TYPE
 
     def __post_init__(self) -> None:
         if self.dvl_type not in TYPES_OF["dvl_type"]:
@@ -104,18 +100,11 @@ class SimulatorNode(AnsweringNode):
     def _subscribe(self, topic: str, reliability: ReliabilityPolicy) -> None:
         """Subscribe reliably, and change to best effort if a best-effort publisher appears."""
 
-        def on_incompatible(event: Any) -> None:
-            if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
-                assert self.executor is not None  # it runs this callback
-                self.executor.create_task(resubscribe)
-
         def resubscribe() -> None:
             self.destroy_subscription(subscription)
             self._subscribe(topic, ReliabilityPolicy.BEST_EFFORT)
 
-        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
-        events = SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False)
-        subscription = self.create_subscription(Odometry, topic, self._on_odometry, profile, event_callbacks=events)
+        subscription = self.subscribe(Odometry, topic, self._on_odometry, QUEUE, resubscribe, reliability)
 
     def _on_odometry(self, message: Any) -> None:
         """Publish the samples that a new odometry message makes computable; restart if its time goes back."""
@@ -149,10 +138,7 @@ def run_until(
     """
     run = simulate(scenario) if follow is None else None
     samples: list[Sample] = [] if run is None else in_order(run)
-    try:
-        rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rclpy raises its own types for bad --ros-args
-        raise InputError(" ".join(str(error).split())) from error
+    init_ros([NODE_NAME, *ros_args])
     node = None
     try:
         node = SimulatorNode(outputs, max(QUEUE, len(samples)))

@@ -1,4 +1,4 @@
-"""Document of a comparison of calibrations."""
+"""Documents of a comparison of calibrations, and of a fleet's catalogue."""
 
 from __future__ import annotations
 
@@ -6,13 +6,36 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from ..calibration.comparison.mounting_change import Comparison, Difference, reasons, remarks
-from ..calibration.results.extrinsics import MOUNTING, Extrinsics
+import numpy as np
+
+from ..calibration.comparison.mounting_change import ANSWERS, POWER, Comparison, Difference, fused, reasons, remarks
+from ..calibration.results.extrinsics import MOUNTING, SCALE, Extrinsics
 from ..calibration.results.mounting_quantities import LATE, date
-from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by
-from .numbers import with_std
+from ..verdict.kinds import Severity
+from ..verdict.reasons import full
+from .document import (
+    Answer,
+    Cell,
+    Columns,
+    Document,
+    Item,
+    Section,
+    Sentence,
+    Table,
+    Where,
+    columns_for,
+    figure,
+    figures,
+    section,
+    table_by,
+)
+from .numbers import counted, number, with_std
+
+if TYPE_CHECKING:
+    from ..fleet_catalogue.update import Fleet
+    from ..fleet_catalogue.vehicle_history import CompassDeviation, NeedsPerson, VehicleHistory
 
 # with more pairs than these a terminal shows only neighbours in time
 MOST_PAIRS = 10
@@ -28,6 +51,10 @@ class ComparedQuantity(NamedTuple):
     unit: str
     factor: float
     changes: str
+
+    def of(self, compared: Extrinsics | Difference) -> tuple[float, float]:
+        """Return its value and σ in a calibration or a difference, in its unit."""
+        return self.factor * compared.value[self.component], self.factor * compared.std[self.component]
 
 
 QUANTITIES = (
@@ -56,9 +83,7 @@ def comparison(result: Comparison) -> Document:
         "samples": lambda each: str(each.used),
         **columns_for(
             {f"{each.name}, {each.unit}": each for each in shown_quantities(result)},
-            lambda each, quantity: with_std(
-                quantity.factor * each.value[quantity.component], quantity.factor * each.std[quantity.component]
-            ),
+            lambda each, quantity: with_std(*quantity.of(each)),
         ),
     }
     own_values = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
@@ -109,13 +134,248 @@ def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Tab
         "": lambda each: each[0],
         **columns_for(
             {f"{each.name}, {each.unit}": each for each in quantities},
-            lambda each, quantity: with_std(
-                quantity.factor * each[1].value[quantity.component],
-                quantity.factor * each[1].std[quantity.component],
-                signed=True,
-            ),
+            lambda each, quantity: with_std(*quantity.of(each[1]), signed=True),
         ),
         "mounting: p": lambda each: f"{each[2]:.{'2f' if each[2] >= 0.01 else '0e'}}",
     }
     rows = [(name, each, each.chance(MOUNTING)) for name, each in zip(names, differences, strict=True)]
     return replace(table_by(columns, rows, (DIFFERENCES_NOTE,)), dense=True)
+
+
+# default speed of sound of instruments, m/s
+SET_SPEED = 1500.0
+# number of recordings named per reason to ask a person
+NAMED = 4
+WORST_FIRST = [*reversed(ANSWERS)]
+MOVEMENTS = ("MOUNTING_MOVED", "MOUNTING_SUSPICIOUS", "MOUNTING_SUSPECTED")
+_ANGLES_AND_SCALE = tuple(each for each in QUANTITIES if each.component in (0, 1, 2, SCALE))
+
+
+def fleet(result: Fleet) -> Document:
+    """Lay out the mounting of each vehicle over time, speed of sound, heading, and recordings that need a person."""
+    vehicles = result.vehicles
+    recordings = result.recordings
+    persons = sum(len(each.recordings) for each in result.persons)
+    severity = ANSWERS[result.word].severity if result.word in ANSWERS else Severity.MARGINAL
+    sentences = [
+        f"{each.name}: {reason.full_sentence}"
+        for each in vehicles
+        if each.compared is not None
+        for reason in reasons(each.compared)
+        if each.compared.verdict != "same" and reason.code in MOVEMENTS
+    ]
+    if not sentences and result.word == "same":
+        sentences = ["No movement found; the table has the smallest detectable movement."]
+    if not sentences:
+        sentences = ["No vehicle has an angle that is observable on two days, so nothing can be compared."]
+    sentences.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
+    done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
+    current = [
+        VehicleNow(each, now(each), [person for person in result.persons if person.vehicle == each.name])
+        for each in vehicles
+    ]
+    current.sort(key=lambda each: each.urgency)
+    speeds = [
+        VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.value[SCALE]))
+        for each in vehicles
+    ]
+    waters = [
+        Sentence(f"{each.name}, {date(each.water.first_ns)[:10]}: {each.water.cause_of_scale}")
+        for each in vehicles
+        if each.water is not None
+    ]
+    several = any(len(each.recordings) > 1 for each in result.persons)
+    compasses = [(each.name, each.heading) for each in vehicles if each.heading is not None]
+    deviations = "; ".join(f"{name} up to {largest(heading):.2f}°" for name, heading in compasses)
+    drawn = figure(
+        "comparison_figures.compass", "Deviation, °", f"Deviation of the heading by heading: {deviations}", compasses
+    )
+    return Document(
+        title="DVL calibrations of a fleet",
+        subtitle=f"{counted(len(vehicles), 'vehicle')}, {counted(recordings, 'recording')}; {done}",
+        answer=Answer(result.word, severity, sentences),
+        warnings=result.notes,
+        sections=[
+            Section(
+                "Vehicles",
+                [
+                    *(Sentence(f"{each.history.name}: {each.word}. {each.why}") for each in current),
+                    replace(table_by(VEHICLES, current, (MOUNTING_NOTE,)), dense=True),
+                ],
+            ),
+            section(
+                "Recordings that need a person",
+                table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=3),
+            ),
+            *(
+                _trend_section(each.history.name, each.history.compared)
+                for each in current
+                if each.history.compared is not None
+            ),
+            section(
+                "Speed of sound",
+                table_by(SPEEDS, [each for each in speeds if each.days], (SPEED_NOTE,)),
+                *waters,
+            ),
+            section(
+                "Deviation of the compass",
+                replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True),
+                drawn if compasses else None,
+            ),
+        ],
+    )
+
+
+def now(vehicle: VehicleHistory) -> Extrinsics | None:
+    """Return the mounting since it last moved; None if no recording is usable."""
+    days = vehicle.days
+    if not days:
+        return None
+    if vehicle.compared is not None and vehicle.compared.moved:
+        since = vehicle.compared.moved[-1].first_after.first_ns
+        days = tuple(each for each in days if each.first_ns >= since)
+    return fused(days)
+
+
+class VehicleNow(NamedTuple):
+    """A vehicle with its current mounting, None if no recording is usable, and its recordings that need a person."""
+
+    history: VehicleHistory
+    mounting: Extrinsics | None
+    persons: Sequence[NeedsPerson]
+
+    @property
+    def word(self) -> str:
+        """Result of comparing the vehicle's days."""
+        return "not compared" if self.history.compared is None else self.history.compared.word
+
+    @property
+    def why(self) -> str:
+        """Reason for the word, and how many recordings need a person."""
+        compared, days = self.history.compared, len(self.history.days)
+        if compared is not None:
+            sentence = reasons(compared)[0].full_sentence
+        elif days:
+            sentence = "One day alone." if days == 1 else "No angle is observable on two days."
+        else:
+            sentence = full(self.persons[0].why).partition(". ")[0].removesuffix(".") + "." if self.persons else ""
+        waiting = sum(len(each.recordings) for each in self.persons)
+        needs = f"{counted(waiting, 'recording')} {'needs' if waiting == 1 else 'need'} a person."
+        return f"{sentence} {needs}" if waiting else sentence
+
+    @property
+    def urgency(self) -> tuple[int, bool]:
+        """Sort key: moved mountings, suspicious ones, vehicles without a calibration, recordings that need a person."""
+        if self.history.compared is None and not self.history.days:
+            return WORST_FIRST.index("suspicious") + 1, False
+        is_same = self.history.compared is None or self.word == "same"
+        return len(WORST_FIRST) if is_same else WORST_FIRST.index(self.word), not self.persons
+
+    @property
+    def detectable_movement(self) -> str:
+        """Detectable movement, degrees, of the least known angle."""
+        compared = self.history.compared
+        return "–" if compared is None else f"{math.degrees(float(np.nanmax(compared.smallest, initial=0.0))):.1f}"
+
+    @property
+    def moved(self) -> int:
+        """Number of times the mounting moved."""
+        return 0 if self.history.compared is None else len(self.history.compared.moved)
+
+
+MOUNTING_NOTE = (
+    "Angles and scale since the mounting last moved, ±1σ, without rejected recordings. Of movements of roll, pitch or "
+    f"yaw as large as 'seen from', {100.0 * POWER:.0f} of 100 are found."
+)
+KINDS = {"moved": "text bad", "suspicious": "text off", "same": "text good"}
+VEHICLES: Columns[VehicleNow] = {
+    "": lambda each: each.history.name,
+    "recordings": lambda each: str(each.history.recordings),
+    "days": lambda each: str(len(each.history.days)),
+    "mounting": lambda each: Cell(
+        each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text")
+    ),
+    "seen from, °": lambda each: each.detectable_movement,
+    **columns_for(
+        {f"{each.name}, {each.unit}": each for each in _ANGLES_AND_SCALE},
+        lambda each, quantity: "–" if each.mounting is None else with_std(*quantity.of(each.mounting)),
+    ),
+}
+SEVERAL_NOTE = "With several recordings the sentence is about the first."
+PERSONS: Columns[NeedsPerson] = {
+    "": lambda each: each.vehicle,
+    "recordings": lambda each: str(len(each.recordings)),
+    "why": lambda each: Cell(
+        full(each.why) + (f" [{each.code}]" if each.code else ""),
+        "text",
+        ", ".join(each.recordings[:NAMED])
+        + (f" and {len(each.recordings) - NAMED} more" if len(each.recordings) > NAMED else ""),
+    ),
+}
+COMPASS_NOTE = (
+    "Error of the heading reference by yaw (0 is east, counter-clockwise), ±1σ; a constant is in the mounting."
+)
+COMPASS: Columns[tuple[str, CompassDeviation]] = {
+    "": lambda each: each[0],
+    "recordings": lambda each: str(each[1].recordings),
+    "largest": lambda each: f"{number(largest(each[1]))}°",
+    **columns_for(
+        {"sin, °": 0, "cos, °": 1, "sin 2, °": 2, "cos 2, °": 3},
+        lambda each, k: with_std(each[1].value[k], each[1].std[k]),
+    ),
+}
+
+
+def _trend_section(name: str, compared: Comparison) -> Section:
+    """Return the section of a vehicle's angles and scale over time."""
+    items: list[Item] = [Sentence(each.full_sentence) for each in reasons(compared)]
+    components = tuple(each.component for each in _ANGLES_AND_SCALE)
+    items.append(figures("comparison_figures.trend", compared, components))
+    return Section(name, items, Where.PAGE)
+
+
+SPEED_NOTE = (
+    "A wrong speed of sound causes a scale error: if it causes all of it, the water had these speeds. If "
+    f"no recording has the DVL's setting, {SET_SPEED:.0f} m/s are assumed."
+)
+
+
+class VehicleSpeeds(NamedTuple):
+    """A vehicle and its days with an observable scale, the smallest scale first."""
+
+    history: VehicleHistory
+    days: Sequence[Extrinsics]
+
+    @property
+    def recommended_setting(self) -> float:
+        """Speed of sound setting of the DVL in the newest recording that has it, m/s; else the default."""
+        used = math.nan if self.history.water is None else self.history.water.used
+        return SET_SPEED if math.isnan(used) else used
+
+
+SPEEDS: Columns[VehicleSpeeds] = {
+    "": lambda each: each.history.name,
+    "days": lambda each: str(len(each.days)),
+    "set to": lambda each: f"{number(each.recommended_setting, 1)} m/s",
+    **columns_for(
+        {"lowest": -1, "highest": 0},
+        lambda each, at: Cell(
+            f"{number(each.recommended_setting / (1.0 + each.days[at].value[SCALE]), 0)} m/s",
+            "",
+            f"{with_std(100.0 * each.days[at].value[SCALE], 100.0 * each.days[at].std[SCALE])} %, "
+            f"{date(each.days[at].first_ns)[:10]}",
+        ),
+    ),
+}
+
+
+def deviation(heading: CompassDeviation, yaw: np.ndarray) -> np.ndarray:
+    """Return the heading deviation in degrees at yaws (N,) rad."""
+    terms = np.stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)], axis=1)
+    found: np.ndarray = terms @ heading.value
+    return found
+
+
+def largest(heading: CompassDeviation) -> float:
+    """Return the largest absolute deviation over all headings, degrees."""
+    return float(np.abs(deviation(heading, np.linspace(0.0, 2.0 * math.pi, 361))).max())

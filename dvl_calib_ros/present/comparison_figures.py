@@ -15,9 +15,8 @@ from matplotlib.figure import Figure
 from ..calibration.comparison.mounting_change import Change, Comparison
 from ..calibration.results.extrinsics import N_COMPONENTS, Extrinsics
 from ..fleet_catalogue.vehicle_history import CompassDeviation
-from .comparison import ComparedQuantity, shown_quantities
+from .comparison import ComparedQuantity, deviation, shown_quantities
 from .figure_style import INK, Picture, drawing, legend_above, new_figure, picture
-from .fleet import deviation
 
 _POINT, _MOVED = "#1f6fb2", "#c0392b"
 PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3
@@ -30,10 +29,9 @@ def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONEN
     """Draw every quantity observable in two calibrations, one picture each. components: restrict to these."""
     pictures = []
     for quantity in (each for each in shown_quantities(comparison) if each.component in components):
-        at = quantity.component
-        known = [each for each in comparison.calibrations if each.shown[at]]
+        known = [each for each in comparison.calibrations if each.shown[quantity.component]]
         values_text = ", ".join(
-            f"{each.name} {quantity.factor * each.value[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
+            "{} {:+.2f} ± {:.2f}".format(each.name, *quantity.of(each))
             for each in (known if len(known) <= MOST_LISTED else (known[0], known[-1]))
         )
         values_text += f", and {len(known) - 2} between them" if len(known) > MOST_LISTED else ""
@@ -70,8 +68,7 @@ def _draw_quantity(axes: Axes, comparison: Comparison, quantity: ComparedQuantit
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
     dated = _dated(comparison.calibrations)
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
-    value = quantity.factor * np.array([each.value[quantity.component] for each in known])
-    std = quantity.factor * np.array([each.std[quantity.component] for each in known])
+    value, std = np.array([quantity.of(each) for each in known]).T
     at = [_middle_day(each) if dated else float(order[id(each)]) for each in known]
     axes.errorbar(at, value, std, fmt="o", color=_POINT, markersize=4.0, capsize=2.5, elinewidth=1.2)
     changes: Sequence[Change] = getattr(comparison, quantity.changes)
@@ -107,13 +104,11 @@ def _middle_day(each: Extrinsics) -> float:
 
 def compass(known: Sequence[tuple[str, CompassDeviation]]) -> Figure:
     """Draw the deviation over the heading, one line per vehicle."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="heading from north, clockwise, °", ylabel="deviation, °")
     north = np.linspace(0.0, 360.0, 181)
     for name, heading in known:
         axes.plot(north, deviation(heading, 0.5 * math.pi - np.radians(north)), label=name)
-    axes.set_xlabel("heading from north, clockwise, °")
     axes.set_xlim(0.0, 360.0)
     axes.set_xticks(range(0, 361, 45))
-    axes.set_ylabel("deviation, °")
     legend_above(axes)
     return figure

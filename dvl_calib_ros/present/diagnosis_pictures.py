@@ -1,8 +1,11 @@
-"""Pictures of a diagnosis: gap by regime, closure by effects, their traces, simulated twin, and residual."""
+"""Pictures of a diagnosis: gap by regime, closure by effects, their traces, simulated twin, and residual.
+
+Also of the comparison of a simulator's DVL with the vehicle's.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,9 +17,22 @@ from scipy.signal import welch
 from ..calibration.numerics.distributions import normal_isf, normal_sf
 from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin, RegressorPlot
+from ..unpaired.gap_ladder import ALL, AS_IT_IS, NOISE, Shrunk
+from ..unpaired.results import UnpairedComparison
 from .diagnosis import twin_errors
-from .figure_data import CUT_FROM_S, TimeAxis, running_mean
-from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
+from .figure_style import (
+    CUT_FROM_S,
+    FAINT,
+    INK,
+    Picture,
+    TimeAxis,
+    legend_above,
+    log_scale,
+    new_figure,
+    picture,
+    rows_figure,
+    running_mean,
+)
 from .numbers import mm
 from .replay_figures import AFTER, BAD
 
@@ -44,14 +60,13 @@ _STYLES = {
 
 def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], points: int, label: str) -> Figure:
     """Draw running means over `points` samples of series (M,), m/s, by name; the last in front."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(ylabel=label)
     t = time(stamps_ns)
     for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
         where, mean = running_mean(t, MM * values, points)
         kept = slice(None, None, max(1, len(where) // LINE_POINTS))
         axes.plot(where[kept], mean[kept], color=colour, linewidth=width, label=name)
     axes.axhline(0.0, color=INK, linewidth=0.7)
-    axes.set_ylabel(label)
     time.label_time(axes)
     legend_above(axes)
     return figure
@@ -64,16 +79,11 @@ def _line_styles(names: Sequence[str]) -> list[tuple[str, float]]:
 
 def spectra(frequency: Array, series: Mapping[str, Array], label: str) -> Figure:
     """Draw amplitude spectral densities (F,) m/s/√Hz of one body axis, by name, over frequency (F,) Hz."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="frequency, Hz", ylabel=label)
     for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
         axes.plot(frequency, MM * values, color=colour, linewidth=width, label=name)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
     axes.set_ylim(*_decade_limits(MM * np.concatenate(list(series.values()))))
-    plain_log_ticks(axes.xaxis)
-    plain_log_ticks(axes.yaxis)
-    axes.set_xlabel("frequency, Hz")
-    axes.set_ylabel(label)
+    log_scale(axes, "xy")
     legend_above(axes)
     return figure
 
@@ -85,33 +95,22 @@ def _decade_limits(values: Array) -> tuple[float, float]:
     return low / widen, high * widen
 
 
-def gap_bars(names: Sequence[str], gaps: Mapping[str, Array]) -> Figure:
-    """Draw the gap in each regime of motion, by name (R, 3): value and 95 per cent interval, m/s."""
-    return _bars(names, gaps, "gap beyond the noise, mm/s rms (95 %)")
+def regime_bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: float | None = None) -> Figure:
+    """Draw bars for each regime of motion, by name (R, 1) or with a 95 per cent interval (R, 3), m/s.
 
-
-def error_bars(names: Sequence[str], errors: Mapping[str, Array], noise: float) -> Figure:
-    """Draw the error in each regime of motion (R, 1) m/s rms, by name, and the common noise."""
-    return _bars(names, errors, "recorded − twin, mm/s rms", noise)
-
-
-def _bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: float | None = None) -> Figure:
-    """Draw bars for each regime, by name (R, 1) or with an interval (R, 3), m/s. noise: a line across all."""
-    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    noise: m/s, a line across all.
+    """
+    figure, axes, places = rows_figure(names, label, pad=0.5)
     height = 0.8 / len(groups)
     for i, ((name, values), (colour, _)) in enumerate(zip(groups.items(), _line_styles(list(groups)), strict=True)):
-        rows = np.arange(len(names)) + (i - 0.5 * (len(groups) - 1)) * height
+        rows = places + (i - 0.5 * (len(groups) - 1)) * height
         value, *interval = MM * values.T
         axes.barh(rows, value, height=0.9 * height, color=colour, alpha=0.85, label=name)
         if interval:
             axes.hlines(rows, *interval, color=INK, linewidth=1.0)
     if noise is not None:
         axes.axvline(MM * noise, color=INK, linewidth=1.0, linestyle=":", label="noise")
-    axes.set_yticks(range(len(names)), names)
-    axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel(label)
-    axes.grid(False, axis="y")
     legend_above(axes)
     return figure
 
@@ -121,7 +120,7 @@ def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
 
     The range is set by the last series; values beyond it are in the last bins.
     """
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="recorded − twin, mm/s", ylabel="density, 1/(mm/s)")
     last = list(values.values())[-1]
     reach = MM * float(max(np.quantile(np.abs(last), 0.995), 4.0 * np.max(noise)))
     edges = np.linspace(-reach, reach, BINS + 1)
@@ -132,8 +131,6 @@ def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
     std = MM * np.maximum(noise, 1e-9)[:, None]
     density = (np.exp(-0.5 * (at / std) ** 2) / (std * np.sqrt(2.0 * np.pi))).mean(axis=0)
     axes.plot(at, density, color=FAINT, linewidth=2.0, label="noise", zorder=1)
-    axes.set_xlabel("recorded − twin, mm/s")
-    axes.set_ylabel("density, 1/(mm/s)")
     axes.set_ylim(bottom=0.0)
     legend_above(axes)
     return figure
@@ -144,7 +141,7 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
 
     The range is set by the last series.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="quantiles of normal noise, mm/s", ylabel="of recorded − twin, mm/s")
     k = max(len(each) for each in values.values())
     end = float(normal_isf(0.5 / k))
     shares = normal_sf(np.linspace(end, -end, QUANTILES))
@@ -154,8 +151,6 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
     axes.plot(of_noise[[0, -1]], of_noise[[0, -1]], color=FAINT, linewidth=2.0, label="noise", zorder=1)
     for (name, each), (colour, _) in zip(values.items(), _line_styles(list(values)), strict=True):
         axes.plot(of_noise, MM * np.quantile(each, shares), ".", color=colour, markersize=3.5, label=name)
-    axes.set_xlabel("quantiles of normal noise, mm/s")
-    axes.set_ylabel("of recorded − twin, mm/s")
     reach = 1.3 * max(float(of_noise[-1]), MM * float(np.abs(list(values.values())[-1]).max()))
     axes.set_ylim(-reach, reach)
     legend_above(axes, markerscale=2.0)
@@ -164,7 +159,7 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
 
 def residual_over_regressor(plotted: RegressorPlot, label: str) -> Figure:
     """Draw the residual against its explaining variable: samples, group means with two standard errors, and scatter."""
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel=plotted.label, ylabel=label)
     at, mean, std, error = plotted.groups()
     every = slice(None, None, max(1, len(plotted.at) // SCATTER_POINTS))
     axes.plot(
@@ -176,8 +171,6 @@ def residual_over_regressor(plotted: RegressorPlot, label: str) -> Figure:
     axes.axhline(0.0, color=INK, linewidth=0.7)
     reach = 1.2 * MM * float(np.nanmax([np.quantile(np.abs(plotted.residual), 0.98), *np.abs(mean) + std]))
     axes.set_ylim(-reach, reach)
-    axes.set_xlabel(plotted.label)
-    axes.set_ylabel(label)
     legend_above(axes, markerscale=2.0)
     return figure
 
@@ -187,17 +180,12 @@ def closure_bars(names: Sequence[str], closures: Array, together: tuple[float, f
     labels = [*names, "together"] if len(names) > 1 else list(names)
     values = [*closures, together[0]] if len(names) > 1 else [together[0]]
     colours = [FAINT] * len(names) + [AFTER] if len(names) > 1 else [AFTER]
-    figure, axes = new_figure(height=1.1 + 0.36 * len(labels))
-    rows = np.arange(len(labels))
+    figure, axes, rows = rows_figure(labels, "share of the gap closed on held-out data, %", height=1.1)
     axes.barh(rows, 100.0 * np.asarray(values), color=colours, height=0.6)
     axes.hlines(rows[-1], 100.0 * together[1], 100.0 * together[2], color=INK, linewidth=1.4)
     axes.axvline(100.0, color=INK, linewidth=0.7, linestyle=":")
-    axes.set_yticks(rows, labels)
-    axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_xlim(min(0.0, 100.0 * float(np.min([*values, together[1]]))), 105.0)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
-    axes.set_xlabel("share of the gap closed on held-out data, %")
-    axes.grid(False, axis="y")
     return figure
 
 
@@ -206,7 +194,7 @@ def measured_against_effect(effect: Array, measured: Array) -> Figure:
 
     Points on the diagonal mean that the effect equals the measurement.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="the effect's trace, mm/s", ylabel="measured, mm/s")
     groups = np.array_split(np.argsort(effect), GROUPS)
     at = MM * np.array([effect[group].mean() for group in groups])
     mean = MM * np.array([measured[group].mean() for group in groups])
@@ -216,8 +204,6 @@ def measured_against_effect(effect: Array, measured: Array) -> Figure:
     axes.errorbar(at, mean, error, fmt="o", markersize=4.0, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(6))
-    axes.set_xlabel("the effect's trace, mm/s")
-    axes.set_ylabel("measured, mm/s")
     legend_above(axes)
     return figure
 
@@ -256,7 +242,7 @@ def regime_picture(series: DiagnosisSeries, with_effects: bool) -> Picture:
         for i, regime in enumerate(names)
     )
     return picture(
-        "Gap by regime of motion", alt, gap_bars, names, gaps,
+        "Gap by regime of motion", alt, regime_bars, names, gaps, "gap beyond the noise, mm/s rms (95 %)",
         caption="Held out."
         + (" Slow and fast: the lowest and the highest third of the speeds." if "slow" in series.regimes else ""),
     )  # fmt: skip
@@ -346,7 +332,10 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
         f"{each.regime}: " + ", ".join(f"{name} {mm(error)} mm/s" for name, error in each.errors.items())
         for each in parts
     )
-    yield picture(f"{twin.name}: error by regime", alt, error_bars, [each.regime for each in parts], errors, twin.level)
+    yield picture(
+        f"{twin.name}: error by regime", alt,
+        regime_bars, [each.regime for each in parts], errors, "recorded − twin, mm/s rms", twin.level,
+    )  # fmt: skip
 
 
 def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:
@@ -363,3 +352,114 @@ def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:
     step = np.floor(SPECTRUM_STEPS * np.log10(frequency / frequency[0])).astype(int)
     _, group, n = np.unique(step, return_inverse=True, return_counts=True)
     return np.bincount(group, frequency) / n, np.sqrt(np.bincount(group, power) / n)
+
+
+# Pictures of a simulator's DVL and the vehicle's.
+
+DVL_AXES = ("x", "y", "z")
+
+
+def shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+    """Draw the decrease of error and distance from the original simulator to one with all effects."""
+    names = [rung.name for rung in c.rungs if rung.name != NOISE]
+    errors = [MM * rung.error_mps for rung in c.rungs if rung.name != NOISE]
+    alt = "; ".join(f"{name}: {error:.1f} mm/s" for name, error in zip(names, errors, strict=True))
+    yield picture("Error of the simulated DVL", alt, error_bars, names, errors, MM * c.floor_mps)
+    yield picture(
+        "Energy distance of recorded and simulated",
+        "; ".join(f"{rung.name}: {rung.distance:.2f}, alike below {rung.null95:.2f}" for rung in c.rungs),
+        distance_bars, [r.name for r in c.rungs], [r.distance for r in c.rungs], [r.null95 for r in c.rungs],
+        caption="Line: 95 % quantile of the distance if recorded and simulated are alike.",
+    )  # fmt: skip
+    shrunk = c.series.get("shrunk")
+    if isinstance(shrunk, Shrunk):
+        last = ALL if ALL in shrunk.errors else NOISE
+        for axis, name in enumerate(DVL_AXES):
+            yield picture(
+                f"Recorded less simulated over time, {name} of the DVL",
+                f"Running means over time of axis {name}: the original simulator, and with all effects",
+                residual_over_time, shrunk, axis, (AS_IT_IS, last),
+            )  # fmt: skip
+
+
+def error_bars(names: Sequence[str], errors: Sequence[float], floor: float) -> Figure:
+    """Draw the error of each model, mm/s, and the noise."""
+    figure, axes, rows = rows_figure(names, "recorded less simulated, held out, mm/s rms")
+    colours = [BAD] + [FAINT] * (len(names) - 2) + [AFTER] if len(names) > 1 else [BAD]
+    axes.barh(rows, errors, color=colours, height=0.6)
+    axes.axvline(floor, color=INK, linewidth=0.9, linestyle=":", label="noise")
+    legend_above(axes)
+    return figure
+
+
+def distance_bars(names: Sequence[str], distances: Sequence[float], null95: Sequence[float]) -> Figure:
+    """Draw the energy distance of each model, and its 95 % quantile if both sides are alike."""
+    figure, axes, rows = rows_figure(names, "energy distance")
+    indistinguishable = [d <= n for d, n in zip(distances, null95, strict=True)]
+    axes.barh(rows, distances, color=[AFTER if each else BAD for each in indistinguishable], height=0.6)
+    axes.vlines(null95, rows - 0.38, rows + 0.38, color=INK, linewidth=1.6)
+    return figure
+
+
+def residual_over_time(shrunk: Shrunk, axis: int, models: Sequence[str]) -> Figure:
+    """Draw the residual on one axis of the DVL with each model, for the recording with the largest."""
+    first = shrunk.errors[models[0]]
+    squares = np.bincount(shrunk.recording_of, np.nansum(first**2, axis=1))
+    at = shrunk.recording_of == int(np.argmax(squares))
+    time = shrunk.time[at]
+    points = max(3, round(WINDOW_SHARE * len(time)))
+    figure, axes = new_figure(
+        xlabel="time from the start, s", ylabel=f"recorded less simulated, {DVL_AXES[axis]}, mm/s"
+    )
+    for model, colour in zip(models, (BAD, AFTER), strict=True):
+        where, mean = running_mean(time, MM * shrunk.errors[model][at, axis], points)
+        axes.plot(where, mean, color=colour, label=AS_IT_IS if model == AS_IT_IS else "with all effects")
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    legend_above(axes)
+    return figure
+
+
+def noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+    """Draw the noise of both sides by regime and by frequency."""
+    if c.levels:
+        alt = "; ".join(f"{name}: {MM * v:.1f} and {MM * s:.1f} mm/s" for name, (v, s) in c.levels.items())
+        yield picture("Noise of the DVL by regime", f"Vehicle and simulator: {alt}", level_bars, c.levels)
+    residuals: Any = c.series.get("residuals")
+    intervals: Any = c.series.get("intervals")
+    if residuals and all(residuals.values()):
+        for axis, name in enumerate(DVL_AXES):
+            lines = {
+                side: residual_spectrum(max(residuals[side], key=len)[:, axis], float(np.median(intervals[side])))
+                for side in residuals
+            }
+            yield picture(
+                f"Residual by frequency, {name} of the DVL",
+                f"Amplitude spectral density of each side's residual on {name}",
+                residual_spectra, lines,
+            )  # fmt: skip
+
+
+def level_bars(levels: Mapping[str, tuple[float, float]]) -> Figure:
+    """Draw the noise of both sides in each regime, m/s."""
+    figure, axes, rows = rows_figure(list(levels), "noise over the axes, mm/s")
+    for i, (side, colour) in enumerate((("vehicle", INK), ("simulator", AFTER))):
+        values = [MM * each[i] for each in levels.values()]
+        axes.barh(rows + (i - 0.5) * 0.38, values, height=0.34, color=colour, label=side)
+    legend_above(axes)
+    return figure
+
+
+def residual_spectrum(values: Array, interval: float) -> tuple[Array, Array]:
+    """Return frequency (F,) Hz and amplitude spectral density (F,) of values (N,)."""
+    frequency, power = welch(values, 1.0 / interval, nperseg=min(len(values), max(16, len(values) // 6)))
+    return frequency[1:], np.sqrt(power[1:])
+
+
+def residual_spectra(lines: Mapping[str, tuple[Array, Array]]) -> Figure:
+    """Draw amplitude spectral densities of both sides, m/s/√Hz."""
+    figure, axes = new_figure(xlabel="frequency, Hz", ylabel="mm/s/√Hz")
+    for (side, (frequency, density)), colour in zip(lines.items(), (INK, AFTER), strict=True):
+        axes.plot(frequency, MM * np.maximum(density, 1e-7), color=colour, label=side)
+    log_scale(axes, "xy")
+    legend_above(axes)
+    return figure

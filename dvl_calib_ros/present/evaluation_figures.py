@@ -9,8 +9,16 @@ from matplotlib.figure import Figure
 
 from ..calibration.numerics.frames import Array
 from .evaluation import CLAIMED
-from .figure_style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
-from .figure_style import plain_log_ticks as log_ticks
+from .figure_style import (
+    INK,
+    MODEL_STYLES,
+    UNCALIBRATED_COLOUR,
+    legend_above,
+    line_widths,
+    log_scale,
+    new_figure,
+    rows_figure,
+)
 
 # position of "all" of a run, seconds beyond the longest window
 ALL_STANDS_S = 40.0
@@ -22,7 +30,7 @@ def improvement_bars(models: Sequence[str], improvement: Array, published: Array
     improvement, published: (S, M) removed share of Avg.VRMSE, nan if missing. Bars are means over the sets, points the
     sets, rings the published figures.
     """
-    figure, axes = new_figure(height=1.2 + 0.3 * len(models))
+    figure, axes = new_figure(height=1.2 + 0.3 * len(models), xlabel="reduction of the uncalibrated Avg.VRMSE, %")
     rows = np.arange(len(models))
     mean = 100.0 * improvement.mean(axis=0)
     axes.barh(rows, mean, color=[MODEL_STYLES[name].color for name in models], height=0.62, alpha=0.85)
@@ -37,7 +45,6 @@ def improvement_bars(models: Sequence[str], improvement: Array, published: Array
     axes.axvline(0.0, color=INK, linewidth=0.8)
     axes.set_yticks(rows, models)
     axes.invert_yaxis()
-    axes.set_xlabel("reduction of the uncalibrated Avg.VRMSE, %")
     axes.grid(False, axis="y")
     legend_above(axes)
     return figure
@@ -55,7 +62,7 @@ def error_over_calibration_time(
 
     uncalibrated: m/s. published: (M,) m/s at published_window_s, nan if missing.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="calibration time, s", ylabel="Avg.VRMSE, m/s")
     finite = [window for window in windows_s if window is not None]
     all_at = (max(finite) if finite else 0.0) + ALL_STANDS_S
     at = np.array([all_at if window is None else window for window in windows_s])
@@ -72,12 +79,9 @@ def error_over_calibration_time(
         axes.plot(
             [published_at], [then], "o", color=colour, markersize=7.0, markerfacecolor="none", markeredgewidth=1.4
         )
-    axes.set_yscale("log")
-    log_ticks(axes.yaxis)
+    log_scale(axes, "y")
     ticks = [window for window in finite if window % 50.0 == 0.0]
     axes.set_xticks([*ticks, all_at], [*(f"{tick:g}" for tick in ticks), "all"])
-    axes.set_xlabel("calibration time, s")
-    axes.set_ylabel("Avg.VRMSE, m/s")
     return figure
 
 
@@ -92,7 +96,7 @@ def misalignment_over_time(
 
     published: s and ° of a published method.
     """
-    figure, axes = new_figure(height=3.2)
+    figure, axes = new_figure(height=3.2, xlabel="calibration time, s", ylabel="error, ° rms")
     for name, std, values in zip(models, gnss_std, degrees, strict=True):
         dashes = ":" if std is None else "--" if std < 0.1 else "-"
         with_what = "no reference" if std is None else f"{std:g} m/s"
@@ -101,20 +105,14 @@ def misalignment_over_time(
             label=f"{name}, {with_what}",
         )  # fmt: skip
     axes.plot(*published, "*", color=INK, markersize=9.0)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    log_ticks(axes.xaxis)
-    log_ticks(axes.yaxis)
-    axes.set_xlabel("calibration time, s")
-    axes.set_ylabel("error, ° rms")
+    log_scale(axes, "xy")
     legend_above(axes)
     return figure
 
 
 def coverage_points(models: Sequence[str], within: Mapping[float, Sequence[float]]) -> Figure:
     """Draw the share of errors inside the intervals of σ; claimed share -> observed share per model, all in 0..1."""
-    figure, axes = new_figure(height=1.1 + 0.28 * len(models))
-    rows = np.arange(len(models))
+    figure, axes, rows = rows_figure(models, "errors inside, %", 1.1, 0.28, pad=0.5, grid=True)
     for (claimed, shares), marker, colour in zip(within.items(), "os", ("#1f6fb2", "#e76300"), strict=True):
         low, high = dict(CLAIMED)[claimed]
         axes.axvspan(100.0 * low, 100.0 * high, color=colour, alpha=0.12, linewidth=0)
@@ -123,26 +121,18 @@ def coverage_points(models: Sequence[str], within: Mapping[float, Sequence[float
             100.0 * np.asarray(shares), rows, marker, color=colour, markersize=5.0, linestyle="none",
             label=f"inside the {100 * claimed:.0f} % interval",
         )  # fmt: skip
-    axes.set_yticks(rows, models)
     axes.set_xlim(0.0, 102.0)
-    axes.set_ylim(len(models) - 0.5, -0.5)
-    axes.set_xlabel("errors inside, %")
     legend_above(axes)
     return figure
 
 
 def error_by_run(runs: Sequence[str], models: Sequence[str], uncalibrated: Array, errors: Array) -> Figure:
     """Draw Avg.VRMSE m/s of every model (L, M), calibrated on each of L runs; uncalibrated: (L,)."""
-    figure, axes = new_figure(height=1.1 + 0.26 * len(runs))
-    rows = np.arange(len(runs))
+    figure, axes, rows = rows_figure(runs, "Avg.VRMSE on all other runs, m/s", 1.1, 0.26, pad=0.5, grid=True)
     axes.plot(uncalibrated, rows, "|", color=UNCALIBRATED_COLOUR, markersize=9.0, markeredgewidth=1.6)
     for name, values in zip(models, errors.T, strict=True):
         colour, dashes = MODEL_STYLES[name]
         filled = colour if dashes == "-" else "white"
         axes.plot(values, rows, "o", color=colour, markersize=4.5, markerfacecolor=filled, markeredgewidth=1.3)
-    axes.set_yticks(rows, runs)
-    axes.set_ylim(len(runs) - 0.5, -0.5)
-    axes.set_xscale("log")
-    log_ticks(axes.xaxis)
-    axes.set_xlabel("Avg.VRMSE on all other runs, m/s")
+    log_scale(axes, "x")
     return figure

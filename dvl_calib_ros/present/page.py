@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Sequence
 from datetime import datetime, timezone
 from functools import cache
 from pathlib import Path
@@ -18,14 +17,12 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
-from ..bag_replay.replay import Replayed
 from ..calibration.comparison.mounting_change import Comparison
 from ..disk.atomic import save_bytes, save_text
 from ..version import __version__
 from .comparison_figures import trend_png
 from .document import Document, Section, Warned, Where
 from .figure_style import MODEL_STYLES
-from .replay import replayed
 from .result_documents import DOCUMENTS
 
 
@@ -88,20 +85,12 @@ def fragment(document: Document) -> str:
     return _environment().get_template("fragment.html").render(context).strip()
 
 
-__all__ = ["write_replay_report", "write_report"]
-
-
 def write_report(path: Path, result: Any) -> None:
     """Write the report (HTML); for a comparison and a path ending in .png only the picture.
 
-    Raises InputError if it cannot be written.
+    result: also its document. Raises InputError if it cannot be written.
     """
     if isinstance(result, Comparison) and path.suffix.lower() == ".png":
         save_bytes(path, trend_png(result))
     else:
-        write_document(path, DOCUMENTS[type(result)](result))
-
-
-def write_replay_report(path: Path, run: Replayed, bags: Sequence[Path], models: Sequence[str]) -> None:
-    """Write the report of a replay with history. models: names to show. Raises InputError."""
-    write_document(path, replayed(run, bags, models))
+        write_document(path, result if isinstance(result, Document) else DOCUMENTS[type(result)](result))

@@ -1,4 +1,4 @@
-"""Document of a replay: verdict, mounting, drift and next commands."""
+"""Document of a replay: verdict, mounting, error terms of the models, drift and next commands."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bag_replay.replay import Replayed
 from ..calibration.assessment.dead_reckoning import in_words, metres
 from ..calibration.assessment.manoeuvre_planner import drift_left_open
-from ..calibration.models import MODELS
+from ..calibration.models import MODELS, Model
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.frames import rpy_from_rotation
+from ..calibration.numerics.frames import Array, rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.results.mounting_quantities import not_shown, quantities
-from ..calibration.results.results import Result, Verification
+from ..calibration.results.results import Estimate, Result, Verification
 from ..files.result_file import result_document
 from ..files.urdf import origin_tag
 from ..verdict.kinds import Severity
@@ -36,17 +38,18 @@ from .document import (
     Numbers,
     Section,
     Sentence,
+    Table,
     Warned,
     Where,
     Worth,
+    columns_for,
     facts_by,
     figure,
     figures,
     section,
     table_by,
 )
-from .error_terms import estimate_table
-from .numbers import fitting_unit, typed
+from .numbers import fitting_unit, typed, with_std
 
 # advice for each verdict
 ADVICE = {
@@ -84,9 +87,10 @@ HELD_OUT_NOTE = (
 )
 HELD_OUT: Columns[Verification] = {
     "model": lambda each: each.model,
-    "uncorrected": lambda each: "–" if each.held_out is None else f"{each.held_out.uncorrected:.4f}",
-    "corrected": lambda each: "–" if each.held_out is None else f"{each.held_out.corrected:.4f}",
-    "predicted": lambda each: "–" if each.held_out is None else f"{each.held_out.predicted:.4f}",
+    **columns_for(
+        {kind: kind for kind in HELD_OUT_KINDS},
+        lambda each, kind: "–" if each.held_out is None else f"{getattr(each.held_out, kind):.4f}",
+    ),
     "samples": lambda each: "0" if each.held_out is None else str(each.held_out.samples),
     "verdict": lambda each: Cell(each.verdict.value, CELL_KINDS[each.verdict]),
 }
@@ -366,3 +370,89 @@ def next_commands(
         return [typed("replay", bags, *options, "--save", "calibration.yaml")]
     commands = [typed("apply", [saved], "--urdf", "robot.urdf")]
     return commands + ([typed("doctor", bags, *options)] if doubts else [])
+
+
+# Error terms in displayed units, and the models' estimates of them.
+
+
+class Term(NamedTuple):
+    """Displayed error term. row: index in φ (3) and δk (3). factor: from SI."""
+
+    row: int
+    name: str
+    in_words: str
+    unit: str
+    factor: float
+
+
+_DEGREE = math.degrees(1.0)
+ANGLES = (
+    Term(0, "φx", "Misalignment about x", "°", _DEGREE),
+    Term(1, "φy", "Misalignment about y", "°", _DEGREE),
+    Term(2, "φz", "Misalignment about z", "°", _DEGREE),
+)
+SCALES = (
+    Term(3, "δk x", "Scale error along x", " %", 100.0),
+    Term(4, "δk y", "Scale error along y", " %", 100.0),
+    Term(5, "δk z", "Scale error along z", " %", 100.0),
+)
+ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
+
+
+def _error_terms(estimate: Estimate) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return φ (3) and δk (3), their standard deviations, and whether the model estimates them; each (6,)."""
+    terms = MODELS[estimate.model].error_terms_from_state
+    variance = np.diag(terms @ estimate.covariance @ terms.T)
+    return terms @ estimate.state, np.sqrt(variance), np.asarray(terms.any(axis=1))
+
+
+def state_of(model: Model, term: Term) -> int:
+    """Return the index of the state of an error term."""
+    return int(np.argmax(model.error_terms_from_state[term.row]))
+
+
+def scale_terms(model: Model) -> list[Term]:
+    """Return the scale terms with their own state: a common δk, or one per axis."""
+    terms = [term for term in SCALES if model.error_terms_from_state[term.row].any()]
+    if len(terms) == 3 and len({state_of(model, term) for term in terms}) == 1:
+        return [ANY_SCALE._replace(in_words="Scale error, all axes")]
+    return terms
+
+
+def estimate_table(result: Result, models: Sequence[str]) -> Table:
+    """Return one row per model, the selected one marked."""
+    per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in models)
+    terms = (*ANGLES, *(SCALES if per_axis else (ANY_SCALE,)))
+    rows = []
+    for name in models:
+        estimate = result.estimates[name]
+        nis = f"{estimate.mean_nis / MODELS[name].n_measurement:.2f}" if estimate.used else "–"
+        cells = _cells(estimate, terms)
+        rows.append((name, *cells, str(estimate.used), str(estimate.gated), nis, estimate.convergence.value))
+    return Table(
+        ("model", *(f"{term.name}, {term.unit.strip()}" for term in terms), "used", "gated", "NIS/m", "convergence"),
+        rows,
+        marked=list(models).index(result.selected),
+        dense=True,
+        notes=(
+            "± is the model's 1σ; ? is not observable in this data; – is not estimated. φ and δk are "
+            "in the DVL's frame. NIS/m: mean normalised innovation squared per measured component, about 1 when the "
+            "noise is as assumed, above when σ is too small.",
+        ),
+    )
+
+
+def _cells(estimate: Estimate, terms: Sequence[Term]) -> list[str]:
+    """Return error terms with ±1σ; – if the model has none, ? if not observable."""
+    model = MODELS[estimate.model]
+    value, std, estimated = _error_terms(estimate)
+    cells = []
+    for term in terms:
+        if not estimated[term.row]:
+            cells.append("–")
+            continue
+        mark = "" if estimate.observability[state_of(model, term)].observed else " ?"
+        is_one = model.scale_axes and term is ANY_SCALE and not estimated[4:].any()
+        axis = " (x)" if is_one else ""
+        cells.append(with_std(*(term.factor * each[term.row] for each in (value, std)), signed=True) + axis + mark)
+    return cells

@@ -24,21 +24,25 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array, rotation_from_rpy, rotation_of, turn_between
 from ..calibration.results.mounting_quantities import quantities
 from ..calibration.results.results import Result, corrected_rpy, rpy_std
-from .error_terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
-from .figure_data import MapTrack, TimeAxis, running_mean, thin
 from .figure_style import (
     FAINT,
     INK,
     MODEL_STYLES,
     REFERENCE_COLOUR,
     WIDTH,
+    MapTrack,
     Picture,
+    TimeAxis,
     legend_above,
     line_widths,
+    log_scale,
     new_figure,
     picture,
-    plain_log_ticks,
+    rows_figure,
+    running_mean,
+    thin,
 )
+from .replay import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
 
 GOOD, WARNING, BAD, AFTER = "#2a7f62", "#e0a030", "#c0392b", "#1f6fb2"
 
@@ -55,7 +59,7 @@ def estimate_over_time(
     time: TimeAxis, stamps_ns: Array, lines: Sequence[ModelLine], selected: str, label: str
 ) -> Figure:
     """Draw one error term with the ±1σ bands of several models; the selected one is highlighted."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(ylabel=label)
     kept = thin(len(stamps_ns))
     t = time(stamps_ns)[kept]
     for line, width in zip(lines, line_widths([line.model for line in lines], selected), strict=True):
@@ -66,7 +70,6 @@ def estimate_over_time(
         dashes = "-" if strong else dashes
         axes.plot(t, value, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=line.model)
     axes.set_ylim(*_settled_range(lines))
-    axes.set_ylabel(label)
     time.label_time(axes)
     return figure
 
@@ -84,7 +87,7 @@ def velocity_over_time(
     time: TimeAxis, dvl_ns: Array, before: Array, after: Array, reference_ns: Array, reference: Array, label: str
 ) -> Figure:
     """Draw one body axis of the velocity: DVL before (N,) and after correction (N,), and the reference (M,), m/s."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(ylabel=label)
     kept = thin(len(reference_ns))
     if len(reference_ns):
         axes.plot(
@@ -95,7 +98,6 @@ def velocity_over_time(
     t = time(dvl_ns)[kept]
     axes.plot(t, before[kept], color=BAD, linewidth=1.0, label="DVL as measured")
     axes.plot(t, after[kept], color=AFTER, linewidth=1.0, label="DVL corrected")
-    axes.set_ylabel(label)
     time.label_time(axes)
     legend_above(axes, markerscale=3.0)
     return figure
@@ -103,7 +105,7 @@ def velocity_over_time(
 
 def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: Array, label: str) -> Figure:
     """Draw DVL minus reference (N,) along one body axis, before and after correction, m/s: points and running mean."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(ylabel=label)
     t = time(stamps_ns)
     for residual, colour, name in ((before, BAD, "before"), (after, AFTER, "after")):
         rms = float(np.sqrt(np.mean(residual**2)))
@@ -112,7 +114,6 @@ def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: A
     axes.axhline(0.0, color=INK, linewidth=0.7)
     spread = 1.2 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.995))
     axes.set_ylim(-spread or -0.01, spread or 0.01)
-    axes.set_ylabel(label)
     time.label_time(axes)
     legend_above(axes)
     return figure
@@ -149,7 +150,7 @@ def _filled_from_next(values: Array) -> Array:
 
 def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Array], selected: str) -> Figure:
     """Draw the mean normalised innovation squared per measurement row (N,) of several models; 1 is expected."""
-    figure, axes = new_figure()
+    figure, axes = new_figure(ylabel="NIS per measured component")
     t = time(stamps_ns)
     for (name, values), width in zip(nis.items(), line_widths(list(nis), selected), strict=True):
         used = np.isfinite(values) & (values > 0.0)
@@ -161,9 +162,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
             where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=name
         )
     axes.axhline(1.0, color=INK, linewidth=0.8)
-    axes.set_yscale("log")
-    plain_log_ticks(axes.yaxis)
-    axes.set_ylabel("NIS per measured component")
+    log_scale(axes, "y")
     time.label_time(axes)
     return figure
 
@@ -171,7 +170,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
 def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) -> Figure:
     """Draw bars of the DVL samples that each model used, gated, or was not given, by reason."""
     colours = (GOOD, BAD, WARNING, FAINT, "#8d99a6", "#d8dde1")
-    figure, axes = new_figure(height=1.1 + 0.28 * len(models))
+    figure, axes = new_figure(height=1.1 + 0.28 * len(models), xlabel="DVL samples")
     bar_start = np.zeros(len(models))
     for (reason, values), colour in zip(counts.items(), colours, strict=False):
         axes.barh(models, values, left=bar_start, color=colour, height=0.7, label=reason)
@@ -179,7 +178,6 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
     axes.invert_yaxis()
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_xlabel("DVL samples")
     axes.grid(False, axis="y")
     legend_above(axes, columns=4)
     return figure
@@ -187,17 +185,14 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
 
 def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
     """Draw velocity errors on held-out data (N,), m/s rms. Points, because each includes the reference's noise."""
-    figure, axes = new_figure(height=1.2 + 0.27 * len(labels))
-    rows = np.arange(len(labels))
+    label = "velocity error on held-out data, m/s rms"
+    figure, axes, rows = rows_figure(labels, label, per_row=0.27, pad=0.5, grid=True)
     axes.hlines(rows, corrected, uncorrected, color=FAINT, linewidth=1.6)
     axes.plot(uncorrected, rows, "|", color=BAD, markersize=11.0, markeredgewidth=2.2, label="uncorrected")
     axes.plot(corrected, rows, "o", color=AFTER, markersize=6.0, label="corrected")
     axes.plot(
         predicted, rows, "D", color=INK, markersize=5.0, markerfacecolor="none", markeredgewidth=1.1, label="predicted"
     )
-    axes.set_yticks(rows, labels)
-    axes.set_ylim(len(labels) - 0.5, -0.5)
-    axes.set_xlabel("velocity error on held-out data, m/s rms")
     legend_above(axes)
     return figure
 
@@ -235,7 +230,7 @@ def mounting_pictures(result: Result) -> list[Picture]:
 def _hull(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
     """Draw the DVL's axes on the hull in one view, as configured and as found."""
     across, up, name = axes_of
-    figure, axes = new_figure(height=2.6)
+    figure, axes = new_figure(height=2.6, xlabel="ahead, m", ylabel=f"{name}, m")
     length = max(_LENGTH, 2.4 * float(np.abs(place).max()))
     axes.add_patch(Ellipse((0.0, 0.0), length, _SLENDER * length, facecolor="#f1f3f5", edgecolor=FAINT))
     axes.annotate(
@@ -247,8 +242,6 @@ def _hull(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Se
     axes.update_datalim([(-0.6 * length, 0.0), (0.85 * length, 0.0)])
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("ahead, m")
-    axes.set_ylabel(f"{name}, m")
     if down:  # port stays on the left, the surface on top
         axes.invert_yaxis()
     legend_above(axes)
@@ -304,7 +297,7 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
     every = np.concatenate(drawn)
     east, north = np.ptp(every, axis=0)
     height = float(np.clip(0.85 * WIDTH * north / max(east, 1e-9) + 0.9, LOWEST, HIGHEST))
-    figure, axes = new_figure(height=height)
+    figure, axes = new_figure(height=height, xlabel="east, m (● start, ■ end)", ylabel="north, m")
     lines = axes.plot(*one.reference.T, color=INK, linewidth=2.6, alpha=0.35, label="reference")
     lines += axes.plot(*one.track_before.T, color=BAD, linewidth=1.2, label="as mounted")
     for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
@@ -320,8 +313,6 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
         axes.plot(*track[-1], "s", color=colour, markersize=3.5)
     axes.plot(*one.reference[-1], "s", color=INK, markersize=3.5)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("east, m (● start, ■ end)")
-    axes.set_ylabel("north, m")
     legend_above(axes)
     return figure
 
@@ -345,14 +336,12 @@ def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
     def off(each: Navigation, track: Array) -> Array:
         return np.asarray(np.linalg.norm(track - each.reference, axis=1))
 
-    figure, axes = new_figure()
+    figure, axes = new_figure(xlabel="distance along the track, m", ylabel="off the reference's track, m")
     axes.plot(one.distances, off(one, one.track_before), color=BAD, label="as mounted")
     for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
         axes.plot(each.distances, off(each, each.track_after), color=colour, label=name or "corrected")
     axes.set_xlim(0.0, one.distance_m)
     axes.set_ylim(0.0, None)
-    axes.set_xlabel("distance along the track, m")
-    axes.set_ylabel("off the reference's track, m")
     legend_above(axes)
     return figure
 
@@ -406,8 +395,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
         ):
             _draw_errors(errors, 1e-9 * (navigation.stamps_ns - first_ns), each, name, colour)
         _legend_above(errors)
-    errors.set_ylabel("DVL less reference, m/s")
-    errors.set_xlabel("time, s")
+    errors.set(xlabel="time, s", ylabel="DVL less reference, m/s")
     for axes in (angles, errors):
         axes.grid(True, alpha=0.3)
     return figure

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
+from rich.padding import Padding
 from rich.table import Column
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -15,10 +17,6 @@ from rich.text import Text
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 from .document import Cell, Commands, Document, Facts, FindingLine, Numbers, Sentence, Table, Where
-
-if TYPE_CHECKING:
-    from rich.padding import Padding
-    from rich.text import Text
 
 # Cells up to this width stay on one line; longer ones are sentences, which may break between words.
 SHORT = 20
@@ -181,8 +179,6 @@ def sections_shown(document: Document) -> Iterator[Any]:
 
 def _finding_lines(reason: Reason) -> Iterator[Padding]:
     """Yield a finding and, indented below it, remedy and code."""
-    from rich.padding import Padding
-
     yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
     remedy = [reason.remedy, " "] if reason.remedy else []
     yield Padding(Text.assemble(*remedy, (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
@@ -196,8 +192,6 @@ def rich_table(table: Table) -> Folding:
 
 def _build(table: Table) -> RichTable:
     """Build the table for rich without fitting it to the terminal."""
-    from rich import box
-
     built = RichTable(
         show_header=any(_cell(name).plain for name in table.head),
         title=Text(table.title, "table.title") if table.title else None,
@@ -216,8 +210,6 @@ def _build(table: Table) -> RichTable:
 
 def _cell(cell: str | Cell) -> Text:
     """Return a cell as styled text, with its small second line appended."""
-    from rich.text import Text
-
     if isinstance(cell, str):
         return Text(cell)
     text = Text(cell.text, _STYLES.get(cell.kind.removeprefix("bar "), ""))

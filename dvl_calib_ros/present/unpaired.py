@@ -100,11 +100,11 @@ def unpaired(found: UnpairedComparison | ClosedGap) -> Document:
                 *(Sentence(f"To tell {each.name}: {each.needs}.") for each in c.effects if each.needs),
             ),
             section(
-                "How far the gap shrinks", rungs, figures("unpaired_figures.shrink_pictures", c) if c.rungs else None
+                "How far the gap shrinks", rungs, figures("diagnosis_pictures.shrink_pictures", c) if c.rungs else None
             ),
             section("Noise and stream", table_by(NOISE, c.noise, words=len(NOISE))),
             section("", Table(LEVELS, levels), where=Where.TERMINAL),
-            section("", figures("unpaired_figures.noise_pictures", c), where=Where.PAGE),
+            section("", figures("diagnosis_pictures.noise_pictures", c), where=Where.PAGE),
             section(
                 "Effects not observable from the motions",
                 Table(("effect", *c.not_shown), unseen, words=1 + len(sides)),

@@ -7,7 +7,7 @@ descriptions; nothing of other topics.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,7 +26,15 @@ from ..calibration.numerics.samples import Mask, Stamps, Stream, Streams, Veloci
 from ..calibration.registration.registration import Registration
 from ..errors import InputError
 from ..messages.decode import RESTAMP_ALL, MessageDecoder
-from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, POSE_TYPES, REFERENCE_TYPES, VELOCITY_TYPES
+from ..messages.drivers import (
+    DVL_TYPES,
+    IMU_TYPE,
+    KNOWN_DEFINITIONS,
+    POSE_TYPES,
+    REFERENCE_TYPES,
+    VELOCITY_TYPES,
+    WANTED_TYPES,
+)
 from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, recognised, suggested
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from ..verdict.reasons import Reason, finding
@@ -549,7 +557,7 @@ def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | Non
 
 def _check_types(recording: Recording, topics: Topics, reasons: list[Reason]) -> None:
     """Raise InputError for a topic of another or of several types; add missing definitions to `found`."""
-    for role, wanted in _WANTED.items():
+    for role, wanted in WANTED_TYPES.items():
         name = getattr(topics, role)
         held = recording.held.get(name)
         if held is None:
@@ -562,9 +570,6 @@ def _check_types(recording: Recording, topics: Topics, reasons: list[Reason]) ->
             raise InputError(f"{recording.where}: topic {name} holds {types}; replay bags of one type together")
         if held.lacks_definition:
             reasons.append(finding("BAG_NO_DEFINITION", type=types))
-
-
-_WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
 
 
 def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:

@@ -77,6 +77,11 @@ class DvlDescription:
     ambiguous: tuple[tuple[str, ...], ...] = ()
     doubts: tuple[str, ...] = ()
 
+    @property
+    def ambiguities(self) -> tuple[str, ...]:
+        """A sentence on each set of indistinguishable effects."""
+        return tuple(f"the data could not distinguish {', '.join(each)}; {each[0]} is used" for each in self.ambiguous)
+
     def __post_init__(self) -> None:
         vectors = (self.mounting_rpy, self.lever_arm, self.scale, self.velocity_bias, self.noise_std or ())
         if not all(math.isfinite(value) for vector in vectors for value in vector):

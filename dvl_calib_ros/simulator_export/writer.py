@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -66,17 +66,15 @@ class Export:
     simulator: str
     settings: Settings
     missing: tuple[Missing, ...]
-    remarks: tuple[str, ...] = field(default_factory=tuple)
+    remarks: tuple[str, ...] = ()
 
 
 def export(name: str, simulator: Simulator, description: DvlDescription) -> Export:
     """Return the settings of a simulator for a DVL."""
     settings = simulator.write(description)
     missing = sorted(_missing(simulator.title, settings, description), key=lambda effect: -(effect.error or 0.0))
-    ambiguous = tuple(
-        f"the data could not distinguish {', '.join(names)}; {names[0]} is used" for names in description.ambiguous
-    )
-    return Export(name, settings, tuple(missing), (*description.doubts, *settings.remarks, *ambiguous, simulator.where))
+    remarks = (*description.doubts, *settings.remarks, *description.ambiguities, simulator.where)
+    return Export(name, settings, tuple(missing), remarks)
 
 
 def export_document(export: Export, description: DvlDescription, version: str) -> dict[str, Any]:

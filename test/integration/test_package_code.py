@@ -89,7 +89,7 @@ def test_only_two_functions_print(calls):
     """`standard_streams` prints lines, `common.console` makes the console: both print what is fit for a terminal."""
     found = {(path.relative_to(PACKAGE).as_posix(), name) for path, name, _ in calls if name in PRINTING}
     assert found == {
-        ("standard_streams.py", "print"), ("cli/common.py", "Console"), ("api/output.py", "Console"),
+        ("standard_streams.py", "print"), ("cli/common.py", "Console"), ("api/calibrated.py", "Console"),
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import pytest
 from command_line import fail, succeed
 from io_fixtures import run, write_bag
 
-from dvl_calib_ros.cli.profile import with_profile
+from dvl_calib_ros.cli.common import with_profile
 
 PROFILE = """
 dvl-topic: /dvl/twist

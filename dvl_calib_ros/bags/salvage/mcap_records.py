@@ -6,7 +6,6 @@ A chunk with a wrong checksum gives nothing: some of it is wrong, and it is unkn
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
@@ -22,7 +21,7 @@ from mcap.records import Channel, ChunkIndex, Schema
 from mcap.summary import Summary
 from numpy.typing import NDArray
 
-from ..files import Hole, holes_in
+from ..files import Hole, holes_in, zstd
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 
 # plain integers, because they are compared for every message
@@ -310,18 +309,12 @@ def places_of(records: bytes, tables: Tables) -> Places | None:
     start, end = start[is_message], end[is_message]
     if (end - start < _HEAD_AT.itemsize).any():
         return None
-    heads = np.ndarray((n - _HEAD_AT.itemsize + 1,), _HEAD_AT, records, strides=(1,))[start]
-    number = heads["channel"].astype(np.intp)
-    if not tables.channels.keys() >= set(np.flatnonzero(np.bincount(number)).tolist()):
+    if any(not SCHEMA <= opcode[other] < MESSAGE for other in others):
         return None
-    for other in others:
-        if not SCHEMA <= opcode[other] < MESSAGE:
-            return None
-        try:
-            tables.note(places[other], int(opcode[other]), records[places[other] + 9 : (*places, n)[other + 1]])
-        except DamagedError:
-            return None
-    return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
+    definitions = [
+        (places[other], int(opcode[other]), records[places[other] + 9 : (*places, n)[other + 1]]) for other in others
+    ]
+    return _known_places(_heads(records, start), start, end, definitions, tables)
 
 
 def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) -> Places | None:
@@ -330,7 +323,7 @@ def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) 
     if not len(starts) or int(starts.max()) > n - _HEAD_AT.itemsize:
         return None
     start = np.sort(starts).astype(np.intp)
-    heads = np.ndarray((n - _HEAD_AT.itemsize + 1,), _HEAD_AT, records, strides=(1,))[start]
+    heads = _heads(records, start)
     length = heads["length"]
     if not ((heads["opcode"] == MESSAGE) & (length >= _MESSAGE_HEAD.size) & (length <= n)).all():
         return None
@@ -341,12 +334,28 @@ def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) 
         return None
     gaps = np.flatnonzero(after > before).tolist()
     between = [_definitions_between(records, int(before[gap]), int(after[gap])) for gap in gaps]
-    number = heads["channel"].astype(np.intp)
-    if None in between or not tables.channels.keys() >= set(np.flatnonzero(np.bincount(number)).tolist()):
+    if None in between:
         return None
-    for opcode, content in (record for found in between for record in found or ()):
+    definitions = [(0, *record) for found in between for record in found or ()]
+    return _known_places(heads, start, end, definitions, tables)
+
+
+def _heads(records: bytes, start: NDArray[np.intp]) -> NDArray[Any]:
+    """Return the heads of message records at these positions."""
+    return np.ndarray((len(records) - _HEAD_AT.itemsize + 1,), _HEAD_AT, records, strides=(1,))[start]
+
+
+def _known_places(
+    heads: NDArray[Any], start: NDArray[np.intp], end: NDArray[np.intp],
+    definitions: Sequence[tuple[int, int, bytes]], tables: Tables,
+) -> Places | None:  # fmt: skip
+    """Note schemas and channels (position, opcode, content) and return the messages; None if anything is unknown."""
+    number = heads["channel"].astype(np.intp)
+    if not tables.channels.keys() >= set(np.flatnonzero(np.bincount(number)).tolist()):
+        return None
+    for definition in definitions:
         try:
-            tables.note(0, opcode, content)
+            tables.note(*definition)
         except DamagedError:
             return None
     return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
@@ -410,11 +419,6 @@ def messages_of(
     found.sort(key=itemgetter(0))
     return found
 
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
 
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, unpacked size, CRC, length of the compression's name
@@ -524,10 +528,6 @@ def _unpack_chunk(file: BinaryIO, at: int, start: int, head: ChunkHead, packed_s
     return Chunk(records, damage, is_believed, end)
 
 
-def _unpack_zstd(packed: bytes, size: int) -> bytes:
-    return _unpack_start(zstd.ZstdDecompressor, packed, size)
-
-
 def _unpack_lz4(packed: bytes, size: int) -> bytes:
     import lz4.frame
 
@@ -536,7 +536,7 @@ def _unpack_lz4(packed: bytes, size: int) -> bytes:
 
 _DECOMPRESS: Mapping[str, Callable[[bytes, int], bytes]] = {
     "": lambda packed, _: packed,
-    "zstd": _unpack_zstd,
+    "zstd": lambda packed, size: _unpack_start(zstd.ZstdDecompressor, packed, size),
     "lz4": _unpack_lz4,
 }
 

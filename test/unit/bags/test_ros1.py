@@ -13,7 +13,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.bags.recover import recover
+from dvl_calib_ros.bags.writer import recover
 from dvl_calib_ros.cli.main import main
 
 NOETIC = get_typestore(Stores.ROS1_NOETIC)

@@ -29,11 +29,10 @@ from dvl_calib_ros.fleet_catalogue import update as running
 from dvl_calib_ros.fleet_catalogue.update import Catalogue
 from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued, histories, need_person
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
-from dvl_calib_ros.present.comparison import QUANTITIES
+from dvl_calib_ros.present.comparison import QUANTITIES, fleet
 from dvl_calib_ros.present.comparison_figures import _draw_quantity
 from dvl_calib_ros.present.document import Sentence
 from dvl_calib_ros.present.figure_style import new_figure
-from dvl_calib_ros.present.fleet import fleet
 
 pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")

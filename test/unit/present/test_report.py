@@ -24,9 +24,9 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.files.urdf import numbers
-from dvl_calib_ros.present.figure_data import MapTrack, TimeAxis, explorable
-from dvl_calib_ros.present.figure_style import MODEL_STYLES, new_figure
-from dvl_calib_ros.present.page import plain, write_replay_report, write_report
+from dvl_calib_ros.present.figure_style import MODEL_STYLES, MapTrack, TimeAxis, explorable, new_figure
+from dvl_calib_ros.present.page import plain, write_report
+from dvl_calib_ros.present.replay import replayed as document_of
 from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, held_out_errors
 from dvl_calib_ros.verdict.kinds import Severity
 
@@ -71,7 +71,7 @@ def test_without_verification_the_report_says_so(tmp_path, made, monkeypatch):
     drawn(monkeypatch)
     replayed = made[1]
     unverified = replace(replayed, result=replace(replayed.result, verifications={}))
-    write_replay_report(tmp_path / "report.html", unverified, [tmp_path], FEW)
+    write_report(tmp_path / "report.html", document_of(unverified, [tmp_path], FEW))
     text = Page(tmp_path / "report.html").text
     assert "not verified" in text and "Held-out" not in text
 
@@ -104,7 +104,7 @@ def test_after_a_reject_there_is_no_mounting_and_no_drift_that_it_would_be_worth
     bag = write_bag(tmp_path / "bag", run())
     replayed = recorded(bag, mounting_rpy=(0.0, 0.0, 0.3))
     assert replayed.result.verifications[replayed.result.selected].verdict is Severity.REJECT
-    write_replay_report(tmp_path / "report.html", replayed, [bag], FEW)
+    write_report(tmp_path / "report.html", document_of(replayed, [bag], FEW))
     text = Page(tmp_path / "report.html").text
     first = text[: text.index("Estimates")]
     assert "reject" in first and "configured" not in first and "DVL on the vehicle" not in first
@@ -115,7 +115,7 @@ def test_warnings_of_models_that_were_not_chosen_are_folded_away(tmp_path, made,
     drawn(monkeypatch)
     own = f"{made[1].result.selected}: says something"
     replayed = replace(made[1], notes=[own, "M7: is not the one", "all: of everything"])
-    write_replay_report(tmp_path / "report.html", replayed, [tmp_path], FEW)
+    write_report(tmp_path / "report.html", document_of(replayed, [tmp_path], FEW))
     html = (tmp_path / "report.html").read_text()
     folded = html[html.index("<details>") : html.index("</details>")]
     assert "not chosen (1)" in folded and "M7: is not the one" in folded
