@@ -24,7 +24,7 @@ from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 
 # Largest number of steps; converged if a step would reduce the deviance by less than this; differences of 1 matter
-MAX_STEPS, CONVERGED_GAIN = 30, 0.03
+MAX_STEPS, CONVERGED_GAIN = 30, 1e-3
 HALVINGS = 5
 # The last step is rejected if it increases the misfit by this factor
 MAX_MISFIT_INCREASE = 30.0

@@ -76,11 +76,8 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def find_unexplained(fitter: Fitter, fit: Fit, null: Fit | None = None) -> Unexplained:
-    """Return the regressor with the most significant score test that predicts held-out stretches of a residual.
-
-    null: the fit from which the tests' null distributions are simulated, by default the same.
-    """
+def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
+    """Return the regressor with the most significant score test that predicts held-out stretches of a residual."""
     problem, noise = fitter.problem, fit.noise
     basis, white = _orthogonal_residual(problem, fit, fit.seen, fit.residual)
     of_motion = _score_tests(problem, fit, fit.seen, basis, white)
@@ -97,7 +94,7 @@ def find_unexplained(fitter: Fitter, fit: Fit, null: Fit | None = None) -> Unexp
     base = fitter.fit_kept(fit.hypothesis.with_effects([], fit.n_recordings, {}), noise)
     left = INTERPOLATION_SHARE * (base.deviance - fit.deviance)
     of_time = [each._replace(left=left) for each in of_time]
-    proposed = sorted(_inflated(problem, null or fit, of_motion) + of_time, key=lambda each: each.log_p)[:N_PREDICTED]
+    proposed = sorted(_inflated(problem, fit, of_motion) + of_time, key=lambda each: each.log_p)[:N_PREDICTED]
     log_p = 0.0
     for each in proposed:
         log_p = min(log_p, _predicted(problem, fit, each).log_p)
@@ -146,15 +143,14 @@ def _score_tests(problem: Problem, fit: Fit, seen: Sequence[Seen], basis: Array,
 
 
 def _inflated(problem: Problem, fit: Fit, of_motion: Sequence[Regressor]) -> list[Regressor]:
-    """Return regressors with the inflation of their energies over chi-square in recordings simulated from a fit."""
-    if "inflation" not in fit.kept:
-        energy, dof = np.full(len(of_motion), PRIOR_DOF), np.full(len(of_motion), PRIOR_DOF)
-        for simulated, seen, residual in simulated_recordings(problem, fit, SIMULATED):
-            tests = _score_tests(simulated, fit, seen, *_orthogonal_residual(simulated, fit, seen, residual))
-            energy += [test.energy for test in tests]
-            dof += [test.dof for test in tests]
-        fit.kept["inflation"] = np.maximum(energy / dof, 1.0).tolist()
-    return [each._replace(inflation=by) for each, by in zip(of_motion, fit.kept["inflation"], strict=True)]
+    """Return regressors with the inflation of their energies over chi-square in simulated recordings, at least 1."""
+    energy, dof = np.full(len(of_motion), PRIOR_DOF), np.full(len(of_motion), PRIOR_DOF)
+    for simulated, seen, residual in simulated_recordings(problem, fit, SIMULATED):
+        tests = _score_tests(simulated, fit, seen, *_orthogonal_residual(simulated, fit, seen, residual))
+        energy += [test.energy for test in tests]
+        dof += [test.dof for test in tests]
+    inflation = np.maximum(energy / dof, 1.0).tolist()
+    return [each._replace(inflation=by) for each, by in zip(of_motion, inflation, strict=True)]
 
 
 def _orthogonal_to_nuisances(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
@@ -216,7 +212,7 @@ def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Un
         drop = reduced.fit.deviance - fit.deviance
         if drop > SETTINGS.instead_of:
             continue
-        new = find_unexplained(fitter, reduced.fit, null=fit)
+        new = find_unexplained(fitter, reduced.fit)
         if not new.found or is_of_group(problem, fit, out, new.about):
             continue
         chance = SETTINGS.indistinguishable + new.log_tried  # more, as the best of several regressors is chosen
