@@ -10,7 +10,7 @@ from command_line import succeed
 from io_fixtures import TOPICS, write_bag
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.bags.writer import BagWriter, Storage
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 
 
@@ -26,7 +26,7 @@ def sound(tmp_path_factory):
 
 def claiming(path, sound, degrees, storage="mcap"):
     """A bag of these messages, whose IMU claims its heading to so many degrees."""
-    with BagWriter(path, storage=storage) as bag:
+    with BagWriter(path, storage=Storage(storage)) as bag:
         for topic, log_ns, message in sound:
             if topic == "imu/data":
                 message.orientation_covariance = np.diag([0.0, 0.0, math.radians(degrees) ** 2]).ravel()
