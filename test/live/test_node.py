@@ -299,7 +299,7 @@ def test_models_are_switched_by_parameter_at_once_and_a_late_subscriber_gets_the
         ("gnss_hysteresis", -1.0, ""),
         ("gnss_hysteresis", "long", "type"),
         ("target_drift", float("nan"), ""),
-        ("result_file", "/no/such/folder/r.yaml", "at run time"),
+        ("result_file", "/no/such/folder/r.yaml", "a running node accepts only"),
         ("no_such_parameter", 1.0, ""),
     ],
 )

@@ -73,7 +73,7 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
 def test_what_the_imu_claims_of_its_heading_is_taken_unless_given(world, tmp_path, given):
     sound, bag, saved = tmp_path / "sound", tmp_path / "bag", tmp_path / "live.yaml"
     write_bag(Scenario(seconds=5.0, gnss_std=0.05), sound, Storage.MCAP, Compression.NONE)
-    with BagReader([sound]) as read, BagWriter(bag, storage="mcap") as written:
+    with BagReader([sound]) as read, BagWriter(bag, storage=Storage.MCAP) as written:
         for topic, log_ns, message, _ in read.messages(TOPICS):
             if topic == "imu/data":
                 message.orientation_covariance = np.diag([0.0, 0.0, math.radians(2.0) ** 2]).ravel()
