@@ -499,7 +499,7 @@ def make_problem(
     """Make the problem on bins where all streams are available, at the initial offsets and at none."""
     lever_arm = np.asarray(lever_arm, dtype=float)
     recordings = [
-        _with_turning_dvl(recording, rotation_dvl_from_body, lever_arm, offset.dvl)
+        _with_dvl_frame(recording, rotation_dvl_from_body, lever_arm, offset.dvl)
         for recording, offset in zip(recordings, offsets, strict=True)
     ]
     grids = tuple(make_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
@@ -507,14 +507,15 @@ def make_problem(
     return problem if problem.measured[2] else replace(problem, observable_turns=_observable_turns(problem))
 
 
-# Share of the squared fourth differences from which on another frame is no better: noise is the same in all
+# The earth's frame is chosen if the squared fourth differences are below this share in it: noise alone gives the same
+# sum in both frames
 BENDING_SHARE = 0.8
 
 
-def _with_turning_dvl(
+def _with_dvl_frame(
     recording: RecordedStreams, rotation_dvl_from_body: Array, lever_arm: Array, delay_s: float
 ) -> RecordedStreams:
-    """Interpolate a slow DVL in the earth's frame if it bends less there. delay_s: of the DVL's stamps.
+    """Choose the frame in which a slow DVL is interpolated: the one where it bends less. delay_s: of the DVL's stamps.
 
     In waves a vehicle rolls between two samples at 1 Hz but hardly changes its velocity over ground; in a turn on calm
     water it is the velocity along its own axes that stays.

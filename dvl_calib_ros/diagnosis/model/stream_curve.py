@@ -66,8 +66,8 @@ class TurningFrame(NamedTuple):
 class Curve:
     """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). reported: (k,)
     reported standard deviation. like: curve of the same stream without simulated noise, which defines the noise level.
-    sample_std: (N, k) standard deviation reported per sample. frame: of the values, if they are interpolated in the
-    earth's."""
+    sample_std: (N, k) standard deviation reported per sample. frame: turning frame of the values, which are then
+    interpolated in the earth's frame; None: they are interpolated as they are."""
 
     time: Array
     values: Array
@@ -93,16 +93,19 @@ class Curve:
 
     @cached_property
     def steady(self) -> Array:
-        """Return the values (N, k); of a turning frame in the earth's, without the swing."""
+        """Return the values (N, k) that are interpolated: with a turning frame in the earth's, without the swing."""
         if self.frame is None:
             return self.values
         return np.einsum("nji,nj->ni", self.frame.rotation(self.time), self.values - self.frame.swing(self.time))
 
     def _measured(self, at: Array, steady: Array) -> Array:
-        """Return the values at times (M,) s of `steady` ones (M, k)."""
-        if self.frame is None:
-            return steady
-        return np.einsum("nij,nj->ni", self.frame.rotation(at), steady) + self.frame.swing(at)
+        """Convert interpolated values (M, k) at times (M,) s back: the inverse of `steady`."""
+        values = self._from_earth(at, steady)
+        return values if self.frame is None else values + self.frame.swing(at)
+
+    def _from_earth(self, at: Array, vectors: Array) -> Array:
+        """Rotate vectors (M, k) of the earth's frame at times (M,) s; without a turning frame, they are unchanged."""
+        return vectors if self.frame is None else np.einsum("nij,nj->ni", self.frame.rotation(at), vectors)
 
     @cached_property
     def denoised(self) -> Curve:
@@ -159,9 +162,7 @@ class Curve:
             return self.like.roughness
         if len(self.time) < 10:
             return np.zeros(self.values.shape[1])
-        fourth = np.diff(self.steady, 4, axis=0)
-        if self.frame is not None:
-            fourth = np.einsum("nij,nj->ni", self.frame.rotation(self.time[2:-2]), fourth)
+        fourth = self._from_earth(self.time[2:-2], np.diff(self.steady, 4, axis=0))
         return robust_std(fourth / self.relative_noise[2:-2]) / np.sqrt(70.0)
 
     @cached_property
