@@ -283,7 +283,7 @@ def dvl_velocity(case: Case, motion: Motion, effects: Effects) -> Array:
         + seen @ shear
         + seen * hours * e.get("scale_drift", {}).get("rate_per_hour", 0.0)
         + seen * fast * e.get("quadratic_scale", {}).get("coefficient_s_per_m", 0.0)
-        + seen * depth / 10.0 * e.get("depth_scale", {}).get("per_10_m", 0.0)
+        + seen * depth * e.get("sound_speed_layer", {}).get("ratio_per_m", 0.0)
         + _three(e, "velocity_bias", "x_mps", "y_mps", "z_mps")
     )
     beam = e.get("switched_beam", {})

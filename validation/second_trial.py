@@ -92,6 +92,7 @@ TABLE: dict[str, Drawn] = {
     "velocity_bias": _vector(0.04, "x_mps", "y_mps", "z_mps"),
     "quadratic_scale": _vector(0.015, "coefficient_s_per_m"),
     "scale_drift": _vector(0.2, "rate_per_hour"),
+    "sound_speed_layer": _vector(0.002, "ratio_per_m"),
     "misalignment_drift": _vector(0.3, "y_rad_per_hour", "z_rad_per_hour"),
     "mount_flexure": _vector(0.02, "y_rad_per_mps", "z_rad_per_mps"),
     "axis_nonorthogonality": _vector(0.03, "xy_rad", "xz_rad", "yz_rad"),
@@ -101,7 +102,6 @@ TABLE: dict[str, Drawn] = {
     "tilt_coupling": _vector(0.2, "x_per_pitch", "z_per_pitch", "y_per_roll", "z_per_roll"),
 }
 OUTSIDE: dict[str, Drawn] = {
-    "depth_scale": _vector(0.02, "per_10_m"),
     "thrust_bias": _vector(0.04, "mps"),
     "switched_beam": _beam,
     "magnetic_passage": _later(0.15, "rad", at_s=(0.2, 0.8), width_s=(0.02, 0.06)),
@@ -123,9 +123,9 @@ def _noise(rng: np.random.Generator, kind: str) -> Noise:
     )  # fmt: skip
 
 
-def _vehicle(rng: np.random.Generator, seed: tuple[int, ...], kind: str, outside: str = "") -> Case:
-    hull = str(rng.choice(["torpedo", "glider"] if outside == "depth_scale" else list(HULLS)))
-    missions = [each for each in HULLS[hull].missions if outside != "depth_scale" or each in ("yo-yo", "spiral")]
+def _vehicle(rng: np.random.Generator, seed: tuple[int, ...], kind: str, dives: bool = False) -> Case:
+    hull = str(rng.choice(["torpedo", "glider"] if dives else list(HULLS)))
+    missions = [each for each in HULLS[hull].missions if not dives or each in ("yo-yo", "spiral")]
     yaw, arm = float(rng.choice([0.0, 0.0, 45.0, -90.0])), rng.normal(0.0, [0.4, 0.1, 0.2])
     x, y, z = np.radians(rng.normal(0.0, [0.7, 0.7, 1.5])).tolist()
     return Case(
@@ -216,7 +216,7 @@ def draw(seed: int, number: int, *, only: str | None = None) -> tuple[Case, str]
             return _vehicle(rng, identity, kind), group
         pool = OUTSIDE if group == "outside" else TABLE
         names = rng.choice(list(pool), int(rng.integers(2, 4)) if group == "several" else 1, replace=False)
-        case = _vehicle(rng, identity, kind, str(names[0]))
+        case = _vehicle(rng, identity, kind, "sound_speed_layer" in names)
         motion, effects = motion_of(case), {}
         for name in map(str, names):
             given = pool[name](rng, case.seconds)

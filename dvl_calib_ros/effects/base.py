@@ -39,6 +39,7 @@ class EffectInput:
     reference_frame: frame in which the reference velocity was recorded; a delay or filter in that frame rotates with
       the vehicle only if it is the body.
     start: s, beginning of the recording; None: the first time.
+    depth_below_start: (N,) m; None if the vertical velocity is not known.
     """
 
     time: Array
@@ -48,6 +49,14 @@ class EffectInput:
     angular_velocity: Array | None = None
     reference_frame: VelocityFrame = VelocityFrame.ENU
     start: float | None = None
+    depth_below_start: Array | None = None
+
+    @property
+    def depth(self) -> Array:
+        """Return depth_below_start for an effect that needs it. Raises ValueError if missing."""
+        if self.depth_below_start is None:
+            raise ValueError("this effect needs the depth (depth_below_start)")
+        return self.depth_below_start
 
     @property
     def attitude(self) -> Array:
@@ -84,6 +93,7 @@ class EffectNeeds(Enum):
 
     ATTITUDE = "attitude"
     ANGULAR_VELOCITY = "angular velocity"
+    DEPTH = "a dive"
 
 
 class ActsOn(Enum):
@@ -313,7 +323,7 @@ class NoiseEffect(AnyEffect, ABC):
         raise InputError(f"effect {self.name}: cannot be made sample by sample; simulate a recorded motion instead")
 
 
-# Slopes, and first-order recursions with varying decay, along time.
+# Slopes, integrals, and first-order recursions with varying decay, along time.
 
 
 def slopes(time: Array, values: Array) -> Array:
@@ -325,6 +335,11 @@ def slopes(time: Array, values: Array) -> Array:
     found[:-1], found[-1] = between, between[-1]
     found[1:-1] += (steps[1:] / (steps[1:] + steps[:-1]))[:, None] * (between[:-1] - between[1:])
     return found
+
+
+def depth_of(time: Array, upwards: Array, first: float = 0.0) -> Array:
+    """Return depths (N,) m at times (N,) s by integrating upward velocities (N,) m/s. first: depth at time[0]."""
+    return np.cumsum(np.append(first, -0.5 * (upwards[1:] + upwards[:-1]) * np.diff(time)))
 
 
 def recursion(decay: Array, added: Array) -> Array:

@@ -29,6 +29,7 @@ OWN: tuple[type[AnyEffect], ...] = (
     sensor.VelocityBias,
     sensor.QuadraticScale,
     sensor.ScaleDrift,
+    sensor.SoundSpeedLayer,
     sensor.MisalignmentDrift,
     sensor.MountFlexure,
     sensor.AxisNonorthogonality,

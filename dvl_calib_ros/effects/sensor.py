@@ -7,7 +7,17 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.numerics.frames import Array
-from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectParameter, MountingEffect, along_axes, vector
+from .base import (
+    HOUR_S,
+    ActsOn,
+    Effect,
+    EffectInput,
+    EffectNeeds,
+    EffectParameter,
+    MountingEffect,
+    along_axes,
+    vector,
+)
 
 
 class VelocityBias(Effect):
@@ -62,11 +72,32 @@ class ScaleDrift(Effect):
     )
     per_recording = True
     acts_on = ActsOn.DVL
-    confounded_with = ("misalignment_drift",)
+    confounded_with = ("misalignment_drift", "sound_speed_layer")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return rate · (t - t_0) · v."""
         return values["rate_per_hour"] / HOUR_S * motion.elapsed[:, None] * motion.velocity_body
+
+
+class SoundSpeedLayer(Effect):
+    """A scale-factor error that changes with depth, because the speed of sound does."""
+
+    name = "sound_speed_layer"
+    summary = "the scale-factor error changes with depth, as sound speed does in layers: ratio · (depth - start) · v"
+    remedy = "let the DVL compute the speed of sound at its depth, from temperature and salinity"
+    manoeuvre = "the same straight leg at three depths, the first one again at the end"
+    parameters = (
+        EffectParameter(
+            "ratio_per_m", "1/m", 0.0005, -0.05, 0.05, "scale-factor error per metre below the start", said=""
+        ),
+    )
+    acts_on = ActsOn.DVL
+    needs = frozenset({EffectNeeds.DEPTH})
+    confounded_with = ("scale_drift",)
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Return ratio · (depth - start) · v."""
+        return values["ratio_per_m"] * motion.depth[:, None] * motion.velocity_body
 
 
 class MisalignmentDrift(MountingEffect):

@@ -66,6 +66,7 @@ _SPOKEN: Mapping[str, tuple[float, str]] = {
     "m/s/rad": (math.radians(1.0), "m/s per °"),
     "1": (100.0, "%"),
     "1/h": (100.0, "%/h"),
+    "1/m": (1000.0, "% per 10 m"),
 }
 _SMALL = {"s": (1e3, "ms"), "m/s": (1e3, "mm/s"), "s/h": (1e3, "ms/h")}
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
-from ..effects.base import ActsOn, EffectInput, NoiseEffect
+from ..effects.base import ActsOn, EffectInput, NoiseEffect, depth_of
 from .scenario import GNSS_PHASE_S, START_NS, Run, Scenario, Seeds, dvl_at, gnss_at, imu_at, world_of
 from .trajectories import Motion
 
@@ -73,6 +73,7 @@ class Follower:
         constants = (effect.values.get("time_constant_s", 0.0) for effect in scenario.effects)
         self._memory_s = REMEMBERED_CONSTANTS * max(constants, default=0.0)
         self._window: deque[MotionSample] = deque()
+        self._depth = 0.0  # m below the start, of the window's first sample
         self._pending: list[tuple[int, int, Sample]] = []
         self._number = itertools.count()
 
@@ -85,7 +86,8 @@ class Follower:
         if len(window) > 2 or (len(window) == 2 and self._pending_from_the_start()):
             self._measure(window[-3].time if len(window) > 2 else -np.inf, window[-2].time)
         while len(window) > 3 and window[1].time < sample.time - self._memory_s:
-            window.popleft()
+            passed = _motion([window.popleft(), window[0]])
+            self._depth = float(depth_of(passed.time, passed.upwards, self._depth)[1])
         reached = START_NS + round(1e9 * sample.time)
         out = []
         while self._pending and self._pending[0][0] <= reached:
@@ -103,14 +105,7 @@ class Follower:
         due = [(sensor, sensor.take_times(until)) for sensor in self._sensors]
         if is_gap or not any(len(at) for _, at in due):
             return
-        window = list(self._window)
-        motion = Motion(
-            np.array([sample.time for sample in window]),
-            np.array([sample.velocity_body for sample in window]),
-            np.array([sample.rotation_enu_from_body for sample in window]),
-            np.array([sample.angular_velocity for sample in window]),
-        )
-        world = world_of(self._scenario, motion, self._disturbed)
+        world = world_of(self._scenario, _motion(self._window), self._disturbed, self._depth)
         for sensor, at in due:
             at = at[at > after]
             for made in sensor.make(self._scenario, world, at, sensor.rng) if len(at) else ():
@@ -122,6 +117,14 @@ class Follower:
             if effect.acts_on is acts_on:
                 velocity = disturbance(velocity, motion)
         return velocity
+
+
+def _motion(samples: Iterable[MotionSample]) -> Motion:
+    columns = zip(
+        *((each.time, each.velocity_body, each.rotation_enu_from_body, each.angular_velocity) for each in samples),
+        strict=True,
+    )
+    return Motion(*map(np.array, columns))
 
 
 class _Sensor:

@@ -16,7 +16,7 @@ from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.numerics.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..calibration.streams.interpolation import linear_at
-from ..effects.base import ActsOn, EffectInput, Injection, at_dvl, late, traces, turns
+from ..effects.base import ActsOn, EffectInput, Injection, at_dvl, depth_of, late, traces, turns
 from ..messages.encode import SampleWriter
 from ..version import __version__
 from .injection import disturbed, injection_document
@@ -146,8 +146,16 @@ def _motion(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Motion, f
     return motion, seconds
 
 
-def world_of(scenario: Scenario, motion: Motion, disturbed_by: Callable[[Array, EffectInput, ActsOn], Array]) -> World:
-    """Return the sensors' input for a motion, whose times are since the beginning of the run."""
+def world_of(
+    scenario: Scenario,
+    motion: Motion,
+    disturbed_by: Callable[[Array, EffectInput, ActsOn], Array],
+    first_depth: float = 0.0,
+) -> World:
+    """Return the sensors' input for a motion, whose times are since the beginning of the run.
+
+    first_depth: m below the start, at the motion's first time.
+    """
     seen = EffectInput(
         motion.time,
         motion.velocity_body,
@@ -156,6 +164,7 @@ def world_of(scenario: Scenario, motion: Motion, disturbed_by: Callable[[Array, 
         motion.angular_velocity,
         scenario.gnss_frame,
         start=0.0,
+        depth_below_start=depth_of(motion.time, motion.upwards, first_depth),
     )
     return World(motion, seen, disturbed_by)
 

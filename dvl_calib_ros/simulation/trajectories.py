@@ -34,6 +34,12 @@ class Motion:
     rotation_enu_from_body: Array
     angular_velocity: Array
 
+    @property
+    def upwards(self) -> Array:
+        """Return the vertical velocity (N,) m/s; term by term, so that parts of a motion give the same values."""
+        row, velocity = self.rotation_enu_from_body[:, 2], self.velocity_body
+        return row[:, 0] * velocity[:, 0] + row[:, 1] * velocity[:, 1] + row[:, 2] * velocity[:, 2]
+
 
 @dataclass(frozen=True)
 class Leg:

@@ -59,7 +59,7 @@ def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     has_rates = recording.attitude is not None or recording.rates is not None
     rates = recording.angular_velocity(oriented) if has_rates else None
     nominal = problem.rotation_dvl_from_body
-    motion = EffectInput(time, velocity, nominal, rotation, rates, recording.frame, 0.0)
+    motion = EffectInput(time, velocity, nominal, rotation, rates, recording.frame, 0.0, recording.depth(time))
     for _ in range(PASSES):  # the trace depends on the true motion
         motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
     moved = at_dvl(injections, motion)

@@ -262,7 +262,8 @@ class Problem:
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
         matrix = hypothesis.body_from_measured(nominal)
-        measured = EffectInput(time, rotate_vectors(matrix, velocity), nominal, rotation, rates, stream.frame, 0.0)
+        in_body, depth = rotate_vectors(matrix, velocity), stream.depth(time)
+        measured = EffectInput(time, in_body, nominal, rotation, rates, stream.frame, 0.0, depth)
         if any(each.effect.acts_on is ActsOn.MOUNTING for each in injections):
             # a small rotation does not change the speed
             turn = turns(injections, undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)[0])

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from ...calibration.streams.clock_correction import SECOND_NS, Clocks
 from ...calibration.streams.position_velocities import NOISY_MPS
 from ...calibration.streams.screening import NOT_MEASURED_VARIANCE, SMALLEST_VARIANCE
 from ...calibration.streams.stream_order import strays
-from ...effects.base import EffectNeeds
+from ...effects.base import EffectNeeds, depth_of
 from ...errors import InputError
 from ...messages.decode import MessageDecoder
 from ...messages.drivers import VELOCITY_TYPES
@@ -92,6 +93,8 @@ UNMEASURED_STD = math.sqrt(NOT_MEASURED_VARIANCE)
 SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3", ".bag")
 # Lowest rate of averaged streams, however long a recording is: one sample per shortest bin
 SLOWEST_AVERAGE_HZ = 1.0 / SETTINGS.shortest_bin
+# Least change of depth, m, of a dive: integrated noise of a vertical velocity at the surface changes it less
+LEAST_DIVE_M = 5.0
 # Samples of the reference per DVL sample that suffice for the comparison
 PER_DVL_SAMPLE = 2.5
 
@@ -136,6 +139,7 @@ class RecordedStreams:
         has = {
             EffectNeeds.ATTITUDE: self.attitude is not None,
             EffectNeeds.ANGULAR_VELOCITY: self.attitude is not None or self.rates is not None,
+            EffectNeeds.DEPTH: self._depth is not None and float(np.ptp(self._depth)) > LEAST_DIVE_M,
         }
         return frozenset(need for need, there in has.items() if there)
 
@@ -155,6 +159,20 @@ class RecordedStreams:
             return rotation_from_quaternion(q / np.sqrt((q * q).sum(axis=1))[:, None])
 
         return np.asarray(attitude.kept.at("rotation", at, rotation))
+
+    @cached_property
+    def _depth(self) -> Array | None:
+        """Return the depth (M,) m of each sample of the reference below the first, None without vertical velocity."""
+        time, values = self.reference.time, self.reference.values
+        if not self.measured[2] or (self.frame is VelocityFrame.BODY and self.attitude is None):
+            return None
+        if self.frame is VelocityFrame.BODY:
+            values = np.einsum("nij,nj->ni", self.rotation_enu_from_body(time), values)
+        return depth_of(time, values[:, 2])
+
+    def depth(self, at: Array) -> Array | None:
+        """Return the depth (M,) m below the start at times (M,) s, None without a vertical velocity."""
+        return None if self._depth is None else np.interp(at, self.reference.time, self._depth)
 
     def angular_velocity(self, at: Array) -> Array:
         """Return the angular velocity (M, 3) rad/s, body axes, at times (M,) s.

@@ -83,6 +83,11 @@ CASES = {
     "velocity_bias": (circle(), {"x_mps": 0.1, "y_mps": 0.2, "z_mps": 0.3}, steady(-0.2, 0.1, 0.3)),
     "quadratic_scale": (circle(), {"coefficient_s_per_m": 0.01}, steady(0.01 * SPEED**2)),
     "scale_drift": (circle(), {"rate_per_hour": 0.5}, steady(0.5 * HOURS * SPEED)),
+    "sound_speed_layer": (
+        replace(circle(), depth_below_start=0.5 * TIME),
+        {"ratio_per_m": 1e-3},
+        steady(5e-4 * TIME * SPEED),
+    ),
     # φ × (0, -u, 0) = (φz u, 0, -φx u) on the DVL's axes; its x is to port
     "misalignment_drift": (
         circle(),
@@ -125,7 +130,8 @@ def some_motion() -> EffectInput:
     velocity = np.column_stack([1.5 + 0.3 * np.sin(0.4 * time), 0.2 * np.cos(time), 0.1 * np.sin(2 * time)])
     rates = np.column_stack([0.1 * np.cos(time), -0.07 * np.sin(0.7 * time), np.full_like(time, 0.3)])
     mounting = rotation_from_rpy((0.1, -0.2, 0.7)).T
-    return EffectInput(time, velocity, mounting, rotation_from_rpy(angles), rates)
+    depth = 3.0 * np.sin(0.05 * time)
+    return EffectInput(time, velocity, mounting, rotation_from_rpy(angles), rates, depth_below_start=depth)
 
 
 def typical(effect, factor=1.0):
@@ -173,7 +179,11 @@ def test_a_trace_says_whether_it_depends_on_the_velocity(name):
 @pytest.mark.parametrize("name", OWN_EFFECTS)
 def test_an_effect_works_without_what_it_does_not_need_and_refuses_without_what_it_does(name):
     effect = EFFECTS[name]
-    lacking = {EffectNeeds.ATTITUDE: "rotation_enu_from_body", EffectNeeds.ANGULAR_VELOCITY: "angular_velocity"}
+    lacking = {
+        EffectNeeds.ATTITUDE: "rotation_enu_from_body",
+        EffectNeeds.ANGULAR_VELOCITY: "angular_velocity",
+        EffectNeeds.DEPTH: "depth_below_start",
+    }
     unneeded = {field: None for need, field in lacking.items() if need not in effect.needs}
     trace = effect.trace(replace(some_motion(), **unneeded), typical(effect))
     assert trace.shape == (200, 3) and np.isfinite(trace).all() and trace.any()
@@ -184,7 +194,7 @@ def test_an_effect_works_without_what_it_does_not_need_and_refuses_without_what_
 
 def test_every_effect_describes_itself():
     names = {**OWN_EFFECTS, **OWN_NOISE}
-    assert len(OWN_EFFECTS) == 19 and len(OWN_NOISE) == 4
+    assert len(OWN_EFFECTS) == 20 and len(OWN_NOISE) == 4
     for effect in names.values():
         assert effect.summary and set(effect.confounded_with) <= set(names), effect.name
         assert effect.name in OWN_NOISE or effect.manoeuvre, effect.name

@@ -16,7 +16,7 @@ from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, rotation_from_quaternion, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import ImuSample, VelocityFrame
-from dvl_calib_ros.effects.base import ActsOn, ClockEffect, Effect, EffectInput, Injection
+from dvl_calib_ros.effects.base import ActsOn, ClockEffect, Effect, EffectInput, Injection, depth_of
 from dvl_calib_ros.effects.registry import EFFECTS, OWN
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.simulation.injection import injection
@@ -44,6 +44,8 @@ def effects(*texts):
 
 def typical(name) -> Injection:
     values = {p.name: p.typical for p in EFFECTS[name].parameters if math.isfinite(p.typical)}
+    if name == "sound_speed_layer":  # a vehicle at the surface hardly changes its depth
+        values = {"ratio_per_m": EFFECTS[name].parameters[0].high}
     return Injection(EFFECTS[name], EFFECTS[name].defaults | values)
 
 
@@ -51,8 +53,9 @@ def true_motion(scenario: Scenario) -> EffectInput:
     motion = make_motion(scenario.trajectory, scenario.seconds, 100.0)
     mounting = rotation_from_rpy(scenario.mounting_rpy).T
     return EffectInput(
-        motion.time, motion.velocity_body, mounting, motion.rotation_enu_from_body, motion.angular_velocity
-    )
+        motion.time, motion.velocity_body, mounting, motion.rotation_enu_from_body, motion.angular_velocity,
+        depth_below_start=depth_of(motion.time, motion.upwards),
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------------ effects
