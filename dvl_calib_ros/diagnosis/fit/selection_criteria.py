@@ -22,7 +22,7 @@ from ..model.seen import Seen
 from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
-from .gauss_newton import EQUAL_DEVIANCE, Fit, Fitter, n_amplitudes, prior_std
+from .gauss_newton import EQUAL_DEVIANCE, PRIOR_BLOCKS, Fit, Fitter, n_amplitudes, prior_std
 
 # Parts of the run at whose ends intermittent effects may begin or end
 WINDOW_STEPS = 10
@@ -103,13 +103,13 @@ def _absorbed(problem: Problem, fit: Fit) -> float:
 def robust_p(fit: Fit, effect: Effect, covariance: Array, blocks: int) -> float:
     """Return p of a Wald test of an effect, adjusted for its alternatives.
 
-    covariance: (6 + p, 6 + p), from a number of blocks.
+    covariance: (6 + p, 6 + p), from a number of blocks and the noise model.
     """
     at = fit.hypothesis.indices_of(effect.name)
     defaults = np.array([each.spec.default for each in fit.hypothesis.parameters_of(effect)])
     values = fit.hypothesis.vector()[at] - defaults
     wald = float(values @ np.linalg.solve(covariance[np.ix_(at, at)], values)) / len(at)
-    return min(1.0, times_tried(effect) * float(f_sf(wald, len(at), max(blocks - len(at), 2))))
+    return min(1.0, times_tried(effect) * float(f_sf(wald, len(at), PRIOR_BLOCKS + max(blocks - len(at), 0))))
 
 
 def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:
