@@ -252,7 +252,7 @@ def _with_steady_clocks(
     likeliest: quick fit at the likeliest delays.
     """
     in_sync = _fit_in_sync(quick, likeliest, rotation)
-    start = likeliest
+    start, held = likeliest, None
     if in_sync.chi2 < IN_SYNC_CHI2:
         explained = _fewest_delayed_clocks(quick, likeliest, in_sync, rotation, lever_arm)
         if not explained.left_open.any():
@@ -260,13 +260,15 @@ def _with_steady_clocks(
         free = _refitted(full, likeliest, rotation)
         if free is None:
             return explained
-        if _fit_in_sync(full, free, rotation).chi2 < IN_SYNC_CHI2:  # only σ of the reference clock changes
+        in_sync = _fit_in_sync(full, free, rotation)
+        if in_sync.chi2 < IN_SYNC_CHI2:  # only σ of the reference clock changes
             return replace(explained, **_reference_clock(full, free, 0.0, rotation))
-        start = free
+        start, held = free, in_sync.fit
     free = _refitted(full, start, rotation)
     if free is None:
         return None
-    return _fewest_delayed_clocks(full, free, _fit_in_sync(full, free, rotation), rotation, lever_arm)
+    in_sync = _fit_in_sync(full, free, rotation) if held is None else _compared(held, free)
+    return _fewest_delayed_clocks(full, free, in_sync, rotation, lever_arm)
 
 
 def _refitted(fit: MotionFit, start: Fitted, rotation: Array | None) -> Fitted | None:
@@ -402,8 +404,11 @@ def _fit_in_sync(
     penalty: chi-square added.
     """
     held = fit(rho, delta, rotation, held_clocks)
-    if held is None or not _is_possible(held):
-        return _HeldFit(None, math.inf)
+    return _HeldFit(None, math.inf) if held is None or not _is_possible(held) else _compared(held, free, penalty)
+
+
+def _compared(held: Fitted, free: Fitted, penalty: float = 0.0) -> _HeldFit:
+    """Compare a fit with synchronised clocks with the fit `free`. penalty: see `_fit_in_sync`."""
     # the number of compared samples depends on the delays
     grown = held.cost(free.level, held.at) * free.rows / held.rows - free.cost(free.level, free.at)
     grown /= free.inflation**2
