@@ -33,9 +33,11 @@ class SectionRows:
         self.slope_variance = block.slope_variance
         self._bins: Bins | None = None
         if rows is not None:
-            residual = np.where(rows.weight > 0.0, rows.residual, np.nan)
+            measured = rows.weight > 0.0
+            residual = np.where(measured, rows.residual, np.nan)
             self.level = masked_median(residual)
             self.residual = residual - self.level
+            self._squares = np.where(measured, self.residual * self.residual, 0.0)
 
     def with_effects(self, velocities: Callable[[Array], Array]) -> SectionRows:
         """Return the rows with derivatives by k effects. velocities: DVL (N, 3) m/s -> its error (N, 3, k)."""
@@ -47,7 +49,7 @@ class SectionRows:
 
     def misfit(self, single: Array) -> Array:
         """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
-        return np.asarray((np.nan_to_num(self.residual) ** 2 / single).sum(axis=1))
+        return np.asarray((self._squares / single).sum(axis=1))
 
     def up(self, x: Array) -> Array | None:
         """Return the mean velocity upwards (21,): derivatives by the states, and m/s at zero states; None if unknown.
