@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..numerics.frames import Array
+from ..numerics.frames import Array, squared, turned_back
 from ..numerics.robust import median
-from ..streams.interpolation import REACH_INTERVALS, attitude_at, linear_at
+from ..streams.interpolation import REACH_INTERVALS, linear_at, quaternion_at
 from .motion_streams import MotionStreams
 
 # Largest searched delay, s.
@@ -39,7 +39,7 @@ class DelayPair(NamedTuple):
 
 
 class _Series(NamedTuple):
-    """Stream on the grid: values (N, 3), known (N,) 0 or 1, squares (N,) of the values; zero where unknown."""
+    """Stream on the grid: values (3, N), known (N,) 0 or 1, squares (N,) of the values; zero where unknown."""
 
     values: Array
     known: Array
@@ -101,27 +101,28 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> _Misfits:
     reference = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
     size = 1 << (len(grid) + 2 * max_shift - 1).bit_length()
     dvl_spectra = _spectra(dvl, size)
+    if rotation is not None:
+        dvl_spectra[:3] = rotation @ dvl_spectra[:3]
     min_count = max(MIN_OVERLAP * min(dvl.known.sum(), reference.known.sum()), MIN_OVERLAP_S / step)
     attitude: Array | None = None
     if motion.in_earth and motion.has_attitude:
-        attitude, oriented = attitude_at(motion.imu, grid, HOLE_S)
+        attitude, oriented = quaternion_at(motion.imu, grid, HOLE_S)
     shifts = range(-max_shift, max_shift + 1) if attitude is not None else (0,)
     misfit = np.full((len(shifts), len(delays)), np.inf)
     for row, shift in enumerate(shifts):
         body = _shifted(reference, shift)
         if attitude is not None:
             known = body.known * oriented
-            values = np.einsum("nji,nj->ni", attitude, body.values) * known[:, None]
-            body = _Series(values, known, body.squares * known)
-        sums = _sums_over_lags(_spectra(body, size), dvl_spectra, rotation, size, max_shift)
+            body = _Series(turned_back(attitude, body.values) * known, known, body.squares * known)
+        sums = _sums_over_lags(_spectra(body, size), dvl_spectra, rotation is not None, size, max_shift)
         is_enough = (sums.n_steps >= min_count) & (sums.squares > 0.0)
         misfit[row, is_enough] = (sums.squares - 2.0 * sums.correlation)[is_enough] / (0.5 * sums.squares[is_enough])
     return _Misfits(delays, np.maximum(misfit, 0.0))
 
 
 def _spectra(series: _Series, size: int) -> Array:
-    """Return the Fourier transforms (F, 5) of three components, known and squares, padded to `size` steps."""
-    return np.asarray(np.fft.rfft(np.column_stack([series.values, series.known, series.squares]), size, axis=0))
+    """Return the Fourier transforms (5, F) of three components, known and squares, padded to `size` steps."""
+    return np.asarray(np.fft.rfft(np.vstack(series), size))
 
 
 class _LagSums(NamedTuple):
@@ -137,26 +138,24 @@ class _LagSums(NamedTuple):
     correlation: Array
 
 
-def _sums_over_lags(body: Array, dvl: Array, rotation: Array | None, size: int, max_shift: int) -> _LagSums:
-    """Return the sums over body(t) and dvl(t + lag) for lags up to `max_shift` steps, from their spectra (F, 5).
+def _sums_over_lags(body: Array, dvl: Array, is_aligned: bool, size: int, max_shift: int) -> _LagSums:
+    """Return the sums over body(t) and dvl(t + lag) for lags up to `max_shift` steps, from their spectra (5, F).
 
-    rotation: (3, 3) C; None for the best one at each lag.
+    is_aligned: the DVL's components are rotated by C; else by the best rotation at each lag.
     """
     conjugate = np.conj(body)
     # count, squares of each where the other is known, then products of the components
-    products = [conjugate[:, i] * dvl[:, j] for i, j in ((3, 3), (3, 4), (4, 3))]
-    if rotation is not None:
-        aligned = conjugate[:, :3] * (dvl[:, :3] @ rotation.T)
-        products.append(aligned.sum(axis=1))
+    products = [conjugate[i] * dvl[j] for i, j in ((3, 3), (3, 4), (4, 3))]
+    if is_aligned:
+        products.append((conjugate[:3] * dvl[:3]).sum(axis=0))
     else:
-        products += [conjugate[:, i] * dvl[:, j] for i in range(3) for j in range(3)]
-    sums = np.fft.irfft(np.array(products), size, axis=1)
+        products += [conjugate[i] * dvl[j] for i in range(3) for j in range(3)]
+    sums = np.fft.irfft(np.array(products), size)
     sums = np.concatenate([sums[:, -max_shift:], sums[:, : max_shift + 1]], axis=1)
-    if rotation is not None:
-        correlation = sums[3]
-    else:
-        # the best orthogonal matrix: either handedness will do for a search
-        correlation = np.linalg.svd(sums[3:].T.reshape(-1, 3, 3), compute_uv=False).sum(axis=1)
+    if is_aligned:
+        return _LagSums(sums[0], sums[1] + sums[2], sums[3])
+    # the best orthogonal matrix: either handedness will do for a search
+    correlation = np.linalg.svd(sums[3:].T.reshape(-1, 3, 3), compute_uv=False).sum(axis=1)
     return _LagSums(sums[0], sums[1] + sums[2], correlation)
 
 
@@ -181,24 +180,16 @@ def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
     after = np.clip(np.searchsorted(mean_times, grid), 1, max(len(mean_times) - 1, 1))
     longest_gap = max(HOLE_S, REACH_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
     if len(mean_times) < 2:
-        return _Series(np.zeros((len(grid), 3)), np.zeros(len(grid)), np.zeros(len(grid)))
+        return _Series(np.zeros((3, len(grid))), np.zeros(len(grid)), np.zeros(len(grid)))
     is_near = mean_times[after] - mean_times[after - 1] <= longest_gap
     known = ((grid >= mean_times[0]) & (grid <= mean_times[-1]) & is_near).astype(float)
-    values = linear_at(mean_times, means, grid) * known[:, None]
-    return _Series(values, known, (values * values).sum(axis=1))
+    values = linear_at(mean_times, means, grid).T * known
+    return _Series(values, known, squared(values.T))
 
 
 def _shifted(series: _Series, steps: int) -> _Series:
     """Return the series shifted by steps: x(t + steps)."""
-    if steps == 0:
-        return series
-    moved = []
-    for column in series:
-        out = np.zeros_like(column)
-        if abs(steps) < len(column):
-            if steps > 0:
-                out[:-steps] = column[steps:]
-            else:
-                out[-steps:] = column[:steps]
-        moved.append(out)
-    return _Series(*moved)
+    n = len(series.known)
+    at = np.arange(n) + steps
+    inside = (at >= 0) & (at < n)
+    return _Series(*(column.take(at, axis=-1, mode="clip") * inside for column in series))

@@ -35,7 +35,7 @@ from ..streams.imu_frame import enu_from, quaternion_product
 from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at, linear_at
 from .configuration_check import BETTER_BY, DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, MIN_SPEED_MPS, QUICK_ROWS, REFERENCE, MotionFit, white_noise
-from .motion_streams import Curves, MotionStreams
+from .motion_streams import MotionStreams
 from .unregistrable_clocks import covered
 
 # Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a
@@ -278,8 +278,8 @@ class Readings:
         rotated = nearest(fit, rotation_found.T @ flu_from_dvl, (REFERENCE,)) if fit else None
         if read is None or rotated is None:
             return False
-        mounting, motion = rotation_dvl_from_body.T @ flu_from_dvl, read.motion
-        wrong = wrong_axes(motion, Curves(motion), mounting, self._position, rotated.level, FROM_MESSAGE)
+        mounting = rotation_dvl_from_body.T @ flu_from_dvl
+        wrong = wrong_axes(read.motion, mounting, self._position, rotated.level, FROM_MESSAGE)
         return wrong is not None and wrong.code == "DVL_LEFT_HANDED"
 
     def without_roll(self, agreement: Agreement, rotation_dvl_from_body: Array) -> Array:
@@ -303,7 +303,7 @@ class Readings:
         """Return the least squares of a reading; None if a required attitude is missing."""
         read = self._read(reading)
         if read is not None and reading not in self._fits:
-            self._fits[reading] = MotionFit(read.motion, self._position, Curves(read.motion), QUICK_ROWS)
+            self._fits[reading] = MotionFit(read.motion, self._position, read.motion.curves, QUICK_ROWS)
         return self._fits.get(reading)
 
     def _read(self, reading: Reading) -> _MotionAsRead | None:

@@ -355,13 +355,13 @@ class MotionFit:
         rows = np.flatnonzero(known)
         if len(rows) < FEWEST_SAMPLES:
             return None
-        body = self._velocity.take(rows, axis=1)
+        # views, without copies, of rows that follow each other
+        at = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] < len(rows) else rows
+        body, rates = self._velocity[:, at], self._curves.rates(body_at[at])
         if attitude is not None:
-            attitude = attitude.T.take(rows, axis=1).T
+            attitude = attitude[at]
             body = turned_back(attitude, body)
-        rates, gain = self._curves.rates(body_at[rows]), dvl.slope_gain[rows]
-        velocity, slope = (columns.T.take(rows, axis=1) for columns in (dvl.value, dvl.slope))
-        return _AtDelays(rows, body, rates, velocity, slope, gain, attitude)
+        return _AtDelays(rows, body, rates, dvl.value[at].T, dvl.slope[at].T, dvl.slope_gain[at], attitude)
 
     def _shared(self, other: Fitted, rho: float, delta: float) -> Mask:
         """Return which of the used references (J,) share DVL samples and attitudes with another fit."""

@@ -64,6 +64,11 @@ class MotionStreams:
         """True if there are attitudes to interpolate between."""
         return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
 
+    @cached_property
+    def curves(self) -> Curves:
+        """Smoothed velocity of the DVL and turn rates."""
+        return Curves(self)
+
     def part(self, rows: Index, margin_s: float) -> MotionStreams:
         """Return consecutive references, with DVL and IMU samples within a margin (s) around them."""
         times = self.reference_times[rows]

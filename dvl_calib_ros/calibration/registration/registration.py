@@ -38,7 +38,7 @@ from .gauss_newton import (  # fmt: skip
     MotionFit,
     N,
 )
-from .motion_streams import Curves, MotionStreams
+from .motion_streams import MotionStreams
 
 # Chi-square that each additional delayed clock must gain.
 GAIN_PER_CLOCK = 12.0
@@ -215,13 +215,12 @@ def _registered(
     motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, *, are_clocks_steady: bool
 ) -> Registration | None:
     """Register a motion, see `register`. are_clocks_steady: skip the search for a clock change."""
-    curves = Curves(motion)
-    full, quick = (MotionFit(motion, lever_arm, curves, most) for most in (FULL_ROWS, QUICK_ROWS))
+    full, quick = (MotionFit(motion, lever_arm, motion.curves, most) for most in (FULL_ROWS, QUICK_ROWS))
     likeliest = _fit_at_likeliest_delays(motion, quick, rotation_body_from_dvl)
     if likeliest is None:
         return None
     if not are_clocks_steady and likeliest.inflation > STEADY_INFLATION:
-        change = _change(motion, curves, lever_arm, rotation_body_from_dvl)
+        change = _change(motion, lever_arm, rotation_body_from_dvl)
         if change is not None:
             changed = _with_change_corrected(motion, full, change, rotation_body_from_dvl, lever_arm)
             # several delays fit each stretch in waves; a real clock change lowers the total residual
@@ -294,8 +293,8 @@ def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: 
     return min(as_good, key=lambda fit: abs(fit.x[RHO]) + abs(fit.dvl_delay_s))
 
 
-def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
-    """Return the clock drift or step between stretches of a motion, or None. curves: of the whole motion."""
+def _change(motion: MotionStreams, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
+    """Return the clock drift or step between stretches of a motion, or None."""
     times = motion.reference_times
     n_stretches = min(int((times[-1] - times[0]) / STRETCH_S), MAX_STRETCHES)
     if n_stretches < 2:
@@ -303,7 +302,9 @@ def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: A
     mean_times, fits = [], []
     for rows in np.array_split(np.arange(len(times)), n_stretches):
         stretch = motion.part(rows, FARTHEST_S)
-        best = _fit_at_likeliest_delays(stretch, MotionFit(stretch, lever_arm, curves, ROWS_OF_STRETCH), rotation)
+        best = _fit_at_likeliest_delays(
+            stretch, MotionFit(stretch, lever_arm, motion.curves, ROWS_OF_STRETCH), rotation
+        )
         if best is not None:
             mean_times.append(float(times[rows].mean()))
             fits.append(best)
