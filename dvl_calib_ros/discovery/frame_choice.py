@@ -270,10 +270,8 @@ class FrameChooser:
     def _dvl_axes_are_said(self) -> bool:
         return self._parameters.dvl_axes != FROM_MESSAGE or self._dvl.frame_id.lower().endswith(("_frd", "_flu"))
 
-    def _reference_priors(
-        self, reference: Preview, imu: ImuHypothesis | None, imu_rates: Array | None
-    ) -> dict[str, float]:
-        """Return the log odds of the frames that a reference may be in, by name. imu_rates: see `_points_down`."""
+    def _reference_priors(self, reference: Preview, imu: ImuHypothesis | None, rates: Array | None) -> dict[str, float]:
+        """Return the log odds of the frames that a reference may be in, by name. rates: see `_points_down`."""
         z_down = self._says_z_down if imu is None else imu.z_down
         own_axes, other_axes = (FRD, FLU) if z_down else (FLU, FRD)
         declared = declared_reference(reference, self._parameters, self._base_frame)
@@ -294,7 +292,7 @@ class FrameChooser:
             agreeing = "body" if observed == own_axes else observed
             return {name: prior + TWIST_POSE_OTHER for name, prior in priors.items()} | {agreeing: 0.0}
         if not z_down and (declared is None or declared.frame is not VelocityFrame.BODY):
-            is_frd = self._points_down(reference, imu, imu_rates)
+            is_frd = self._points_down(reference, imu, rates)
             priors["body" if is_frd else FRD] += TWIST_RATES_OTHER
         return priors
 
