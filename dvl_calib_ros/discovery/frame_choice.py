@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,7 @@ from ..calibration.registration.frame_hypotheses import (
     nominal_rpy,
 )
 from ..calibration.streams.imu_frame import ENU_FROM
+from ..calibration.streams.interpolation import GAP_S, TurnRates, angular_velocity_at
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import DECLARED_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
@@ -239,13 +241,18 @@ class FrameChooser:
 
     def _body_is_z_down(self, frame: ImuFrame) -> bool:
         """Return whether the body's z points down under a hypothesis of the IMU, by its attitude."""
+        if self._mean_rotation is None:
+            return self._says_z_down
+        up = ENU_FROM[frame.world][2] @ self._mean_rotation
+        return bool(up @ frame.rotation_body_from_imu.T[:, 2] < 0.0)
+
+    @cached_property
+    def _mean_rotation(self) -> Array | None:
+        """Mean (3, 3) of the IMU's rotation matrices, its world from its axes; None without an attitude."""
         assert self._imu is not None
         quaternion = unit_quaternions(self._imu.values[:, :4])
         known = np.isfinite(quaternion).all(axis=1)
-        if not known.any():
-            return self._says_z_down
-        up = ENU_FROM[frame.world][2] @ rotation_from_quaternion(quaternion[known]).mean(axis=0)
-        return bool(up @ frame.rotation_body_from_imu.T[:, 2] < 0.0)
+        return rotation_from_quaternion(quaternion[known]).mean(axis=0) if known.any() else None
 
     def dvl_is_turned(self, z_down: bool) -> bool:
         """Return whether frame, transform and type declare DVL axes that must be converted to those of base_frame."""
@@ -263,8 +270,8 @@ class FrameChooser:
     def _dvl_axes_are_said(self) -> bool:
         return self._parameters.dvl_axes != FROM_MESSAGE or self._dvl.frame_id.lower().endswith(("_frd", "_flu"))
 
-    def _reference_priors(self, reference: Preview, imu: ImuHypothesis | None) -> dict[str, float]:
-        """Return the log odds of the frames that a reference may be in, by name."""
+    def _reference_priors(self, reference: Preview, imu: ImuHypothesis | None, rates: Array | None) -> dict[str, float]:
+        """Return the log odds of the frames that a reference may be in, by name. rates: see `_points_down`."""
         z_down = self._says_z_down if imu is None else imu.z_down
         own_axes, other_axes = (FRD, FLU) if z_down else (FLU, FRD)
         declared = declared_reference(reference, self._parameters, self._base_frame)
@@ -285,14 +292,17 @@ class FrameChooser:
             agreeing = "body" if observed == own_axes else observed
             return {name: prior + TWIST_POSE_OTHER for name, prior in priors.items()} | {agreeing: 0.0}
         if not z_down and (declared is None or declared.frame is not VelocityFrame.BODY):
-            is_frd = self._points_down(reference, imu)
+            is_frd = self._points_down(reference, imu, rates)
             priors["body" if is_frd else FRD] += TWIST_RATES_OTHER
         return priors
 
-    def _points_down(self, reference: Preview, imu: ImuHypothesis | None) -> bool:
-        """Return whether a twist is forward-right-down, by its turn rates or else by its pose's world."""
-        if self._imu is not None and imu is not None and reference.rates is not None:
-            is_frd = are_rates_frd(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
+    def _points_down(self, reference: Preview, imu: ImuHypothesis | None, imu_rates: Array | None) -> bool:
+        """Return whether a twist is forward-right-down, by its turn rates or else by its pose's world.
+
+        imu_rates: (N, 3) rad/s of the IMU at the reference's times, its own axes; None unless both have rates.
+        """
+        if imu is not None and imu_rates is not None and reference.rates is not None:
+            is_frd = are_rates_frd(reference.rates, imu_rates @ imu.frame.rotation_body_from_imu.T)
             if is_frd is not None:
                 return is_frd
         world = frame_named(reference.world, ())  # of the pose: by custom a body in NED is forward-right-down
@@ -375,10 +385,14 @@ class FrameChooser:
     def _hypotheses(self, reference: Preview) -> dict[Reading, _Hypothesis]:
         """Return all readings: each frame of the reference, under each hypothesis of the IMU, with either DVL axes."""
         hypotheses: dict[Reading, _Hypothesis] = {}
+        imu_rates = None
+        if self._imu is not None and reference.rates is not None:
+            turns = TurnRates.of(imu_columns_of(self._imu))
+            imu_rates = angular_velocity_at(turns, reference.stamps_s, GAP_S)
         for imu in (*self.imus,) or (None,):
             frame, imu_prior = (None, 0.0) if imu is None else (imu.frame, imu.prior)
             declared = self.dvl_is_turned(self._says_z_down if imu is None else imu.z_down)
-            for name, prior in self._reference_priors(reference, imu).items():
+            for name, prior in self._reference_priors(reference, imu, imu_rates).items():
                 for is_turned in {declared} if self._dvl_axes_are_said else {declared, not declared}:
                     axes_prior = 0.0 if is_turned == declared else DVL_AXES_OTHER
                     reading = Reading(name, frame, is_turned)

@@ -245,11 +245,9 @@ class _PreviewRows:
         is_velocity = self._kind is not None
         self._variances.append(decoded.variances.mean(axis=1) if is_velocity else np.array([decoded.heading_variance]))
         # the first message with a frame suffices
-        self._names += [
-            (int(arrival), part.decoded.frames[place])
-            for arrival, place in zip(decoded.arrival.tolist(), decoded.frame.tolist(), strict=True)
-            if part.decoded.frames[place]
-        ][:1]
+        is_named = np.array([bool(frame) for frame in decoded.frames], dtype=bool)
+        for row in np.flatnonzero(is_named[decoded.frame])[:1].tolist():
+            self._names.append((int(decoded.arrival[row]), decoded.frames[decoded.frame[row]]))
 
     def _add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
         """Decode and add messages, each with its arrival and log time (ns)."""

@@ -19,31 +19,49 @@ DELAYS_S: Array = STEP_S * np.arange(-16, 17)
 SEARCHED_BLOCKS, MIN_CHI2_GAIN, CORRELATED_ROWS, MIN_ROWS = 64, 30.0, 5.0, 40
 
 
-def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameters) -> float:
-    """Return the DVL delay (s) that fits significantly better than the current one, or the current one."""
-    if len(blocks) > SEARCHED_BLOCKS:
-        return delay
-    rows = [_dvl_at_delays(joined, parameters) for _, joined in joined_blocks(blocks)]
-    squares = _residual_squares(rows) if rows else None
-    if squares is None:
-        return delay
-    best = int(np.argmin(squares))
-    at_current = float(np.interp(delay, DELAYS_S, squares))
-    n = sum(len(row.body) for row in rows)
-    is_significant = n * math.log(at_current / squares[best]) > MIN_CHI2_GAIN * CORRELATED_ROWS
-    return float(DELAYS_S[best]) if is_significant and abs(DELAYS_S[best] - delay) > STEP_S else delay
+class DelaySums(NamedTuple):
+    """Normal equations of a linear fit of forward and port velocity at each of K delays, summed over blocks of a day.
+
+    Velocity and rates of three axes have free coefficients, which include mounting, scale and lever arm.
+
+    n_blocks: number of blocks. n_rows: number of references.
+    information: (K, 6, 6). vector: (K, 6, 2).
+    square: squared velocities, (m/s)².
+    """
+
+    n_blocks: int = 0
+    n_rows: int = 0
+    information: Array = 1e-9 * np.eye(6)
+    vector: Array = np.zeros((1, 6, 2))
+    square: float = 0.0
+
+    def after(self, blocks: Sequence[FitBlock], parameters: Parameters) -> DelaySums:
+        """Return the sums with the new ones of a day's blocks. More than SEARCHED_BLOCKS are not summed."""
+        sums = self._replace(n_blocks=len(blocks))
+        new = blocks[self.n_blocks :] if len(blocks) <= SEARCHED_BLOCKS else ()
+        for _, joined in joined_blocks(new):
+            body, design = _rows_at_delays(joined, parameters)
+            sums = sums._replace(
+                n_rows=sums.n_rows + len(body), square=sums.square + float((body**2).sum()),
+                information=sums.information + design.swapaxes(1, 2) @ design,
+                vector=sums.vector + design.swapaxes(1, 2) @ body,
+            )  # fmt: skip
+        return sums
+
+    def better(self, delay: float) -> float:
+        """Return the DVL delay (s) that fits significantly better than the current one, or the current one."""
+        if self.n_rows < MIN_ROWS or self.n_blocks > SEARCHED_BLOCKS:
+            return delay
+        solved = np.linalg.solve(self.information, self.vector)
+        squares = np.maximum(self.square - (self.vector * solved).sum(axis=(1, 2)), 1e-12)
+        best = int(np.argmin(squares))
+        at_current = float(np.interp(delay, DELAYS_S, squares))
+        is_significant = self.n_rows * math.log(at_current / squares[best]) > MIN_CHI2_GAIN * CORRELATED_ROWS
+        return float(DELAYS_S[best]) if is_significant and abs(DELAYS_S[best] - delay) > STEP_S else delay
 
 
-class _DvlAtDelays(NamedTuple):
-    """References and the DVL at every delay: body (J, 3) m/s, velocity (K, J, 3) m/s, rates (J, 3) rad/s."""
-
-    body: Array
-    velocity: Array
-    rates: Array
-
-
-def _dvl_at_delays(joined: JoinedBlocks, parameters: Parameters) -> _DvlAtDelays:
-    """Return the comparable references of blocks with the DVL at every delay."""
+def _rows_at_delays(joined: JoinedBlocks, parameters: Parameters) -> tuple[Array, Array]:
+    """Return the comparable references (J, 2) m/s, body, and the DVL's velocity and rates (K, J, 6) at every delay."""
     reference = joined.reference
     imu = joined.attitude_at(reference.times, parameters.imu_timeout)
     velocity, seen = joined.dvl_at(reference.times + DELAYS_S[:, None])
@@ -51,21 +69,5 @@ def _dvl_at_delays(joined: JoinedBlocks, parameters: Parameters) -> _DvlAtDelays
     known &= imu.rates_known & joined.measured[:, :2].all(axis=1)
     onto = np.where(reference.in_body[:, None, None], np.eye(3), imu.rotation.swapaxes(1, 2))
     body = product(onto, np.where(joined.measured, reference.velocity, 0.0))
-    return _DvlAtDelays(body[known], velocity[:, known], imu.rates[known])
-
-
-def _residual_squares(parts: Sequence[_DvlAtDelays]) -> Array | None:
-    """Return the squared residuals (K,) of a linear fit of forward and port velocity; None for too few rows.
-
-    Velocity and rates of three axes have free coefficients, which include mounting, scale and lever arm.
-    """
-    body = np.concatenate([part.body for part in parts])[:, :2]
-    if len(body) < MIN_ROWS:
-        return None
-    velocity = np.concatenate([part.velocity for part in parts], axis=1)
-    rates = np.concatenate([part.rates for part in parts])
-    design = np.concatenate([velocity, np.broadcast_to(rates, velocity.shape)], axis=2)  # (K, J, 6)
-    information = design.swapaxes(1, 2) @ design + 1e-9 * np.eye(6)
-    vector = design.swapaxes(1, 2) @ body
-    squares: Array = (body**2).sum() - (vector * np.linalg.solve(information, vector)).sum(axis=(1, 2))
-    return np.maximum(squares, 1e-12)
+    velocity = velocity[:, known]
+    return body[known, :2], np.concatenate([velocity, np.broadcast_to(imu.rates[known], velocity.shape)], axis=2)

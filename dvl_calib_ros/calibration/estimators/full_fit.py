@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..assessment.dead_reckoning import SlowNoise
-from ..checks.beam_faults import N_EFFECTS, BeamFault, effect_velocities, most_significant
+from ..checks.beam_faults import N_EFFECTS, BeamFault, most_significant
 from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, REFERENCE_ERROR, SCALE
 from ..models.parameters import Parameters
@@ -28,10 +28,10 @@ from ..numerics.kalman import GaussianState, covariance_of
 from ..numerics.robust import MEDIAN_DISTANCE, ROUNDING_MPS
 from ..numerics.samples import Index
 from ..results.results import TAPE_STD_M
-from .full_delay_search import better_delay
+from .full_delay_search import DelaySums
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
 from .full_held_out import INSTRUMENT_ERRORS, HeldOutSums
-from .section_rows import GATE_SQUARE, SectionRows, effects_gram, masked_median, section_starts, usual_square
+from .section_rows import GATE_SQUARE, SectionRows, beam_fault_grams, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
 OF_DAY = FULL.of_day
@@ -86,6 +86,7 @@ class _Day:
     """Blocks of one day (recordings with one DVL delay), and their normal equations about the point of linearisation.
 
     count: number of blocks so far.
+    delays: search of the DVL's delay.
     sections: of the blocks whose streams are kept.
     before: chains of older blocks, with all sections and without each fold.
     chain: of all blocks.
@@ -96,6 +97,7 @@ class _Day:
 
     blocks: list[FitBlock] = field(default_factory=list)
     count: int = 0
+    delays: DelaySums = field(default_factory=DelaySums)
     sections: list[_Section] = field(default_factory=list)
     before: list[Chain] | None = None
     chain: Chain | None = None
@@ -213,8 +215,6 @@ class JointFit:
                         day.chain = day.chain.after(section.gram, section.seconds, self._points.slow)
             self._solve()
 
-    # ------------------------------------------------------------------ blocks
-
     def add(self, block: FitBlock) -> None:
         """Take the next block. Raise numpy.linalg.LinAlgError and keep the earlier fit if numbers diverge."""
         day = self._days[-1]
@@ -303,8 +303,9 @@ class JointFit:
 
     def _renew(self) -> None:
         """Run Gauss-Newton from the newest estimate over all blocks whose streams are kept."""
-        place = self._of_day(len(self._days) - 1)[DELAY]
-        self._x[place] = better_delay(self._days[-1].blocks, float(self._x[place]), self._parameters)
+        day, place = self._days[-1], self._of_day(len(self._days) - 1)[DELAY]
+        day.delays = day.delays.after(day.blocks, self._parameters)
+        self._x[place] = day.delays.better(float(self._x[place]))
         last = np.zeros_like(self._x)
         for _ in range(MAX_STEPS):
             self._linearise()
@@ -489,14 +490,12 @@ class JointFit:
                 continue
             x = self._x[self._of_day(number)]
             at = np.append(self._of_day(number), effects)
-            for part in self._parts(day.blocks, x):
-                if part.rows is None:
-                    continue
-                gram = effects_gram(part, effect_velocities, x, day.single, day.white, self._points.slow.part(points))
+            parts = [part for part in self._parts(day.blocks, x) if part.rows is not None]
+            velocity += [part.rows.dvl for part in parts if part.rows is not None]
+            for gram in beam_fault_grams(parts, x, day.single, day.white, self._points.slow.part(points)):
                 information, vector = np.zeros((1, n, n)), np.zeros((1, n))
                 information[0][np.ix_(at, at)], vector[0, at] = gram[:-1, :-1], gram[:-1, -1]
                 blocks.add(information, vector, 1.0)
-                velocity.append(part.rows.dvl)
         if not velocity:
             return None
         mean_velocity = np.concatenate(velocity).mean(axis=0)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 
+from ..checks.beam_faults import N_EFFECTS, effect_velocities
 from ..models.own import BIAS
 from ..numerics.block_covariance import BLOCK_S
 from ..numerics.frames import Array
@@ -33,21 +34,23 @@ class SectionRows:
         self.slope_variance = block.slope_variance
         self._bins: Bins | None = None
         if rows is not None:
-            residual = np.where(rows.weight > 0.0, rows.residual, np.nan)
+            measured = rows.weight > 0.0
+            residual = np.where(measured, rows.residual, np.nan)
             self.level = masked_median(residual)
             self.residual = residual - self.level
+            self._squares = np.where(measured, self.residual * self.residual, 0.0)
 
-    def with_effects(self, velocities: Callable[[Array], Array]) -> SectionRows:
-        """Return the rows with derivatives by k effects. velocities: DVL (N, 3) m/s -> its error (N, 3, k)."""
+    def with_beam_faults(self) -> SectionRows:
+        """Return the rows with derivatives by the k effects of a beam's fault."""
         assert self.rows is not None
-        more = self.rows.columns[:, :, BIAS] @ velocities(self.rows.dvl)
+        more = self.rows.columns[:, :, BIAS] @ effect_velocities(self.rows.dvl)
         whole = copy.copy(self)
         whole._bins, whole.rows = None, self.rows._replace(columns=np.concatenate([self.rows.columns, more], axis=2))
         return whole
 
     def misfit(self, single: Array) -> Array:
         """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
-        return np.asarray((np.nan_to_num(self.residual) ** 2 / single).sum(axis=1))
+        return np.asarray((self._squares / single).sum(axis=1))
 
     def up(self, x: Array) -> Array | None:
         """Return the mean velocity upwards (21,): derivatives by the states, and m/s at zero states; None if unknown.
@@ -71,19 +74,18 @@ class SectionRows:
         return self._bins
 
 
-def effects_gram(
-    section: SectionRows, velocities: Callable[[Array], Array], x: Array, single: Array, white: Array, slow: SlowErrors
-) -> Array:
-    """Return the Gram matrix (21 + k, 21 + k) of a section over [states, effects, residual], without slow errors.
+def beam_fault_grams(sections: Sequence[SectionRows], x: Array, single: Array, white: Array, slow: SlowErrors) -> Array:
+    """Return the Gram matrices (S, 21 + k, 21 + k) of S sections over [states, effects, residual], without slow errors.
 
-    velocities: see `SectionRows.with_effects`.
     x: (20,) point of linearisation.
     single, white: (3,) variances.
+    slow: at one point of the prior.
     """
-    bins = section.with_effects(velocities).bins(single)
-    k = bins.rows.shape[2] - WIDTH
-    gram = gram_of(bins, white, np.append(x, np.zeros(k)), section.slope_variance)
-    return np.asarray(Chain.begun(slow, k).after(gram, BLOCK_S, slow).ended().gram[0])
+    bins = [section.with_beam_faults().bins(single) for section in sections]
+    x, k = np.append(x, np.zeros(N_EFFECTS)), N_EFFECTS
+    grams = [gram_of(own, white, x, each.slope_variance) for own, each in zip(bins, sections, strict=True)]
+    slow = SlowErrors(*(np.repeat(values, len(sections), axis=0) for values in slow))
+    return Chain.begun(slow, k).after(np.reshape(grams, (-1, WIDTH + k, WIDTH + k)), BLOCK_S, slow).ended().gram
 
 
 def usual_square(values: Array) -> Array:

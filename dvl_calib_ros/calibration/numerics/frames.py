@@ -54,6 +54,13 @@ def cross(a: Array, b: Array) -> Array:
     return product
 
 
+def cross_columns(a: Array, b: Array) -> Array:
+    """Return a × b (3, N) of vectors as columns, (3, N) or (3,)."""
+    x, y, z = a
+    u, v, w = b
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
 def squared(a: Array) -> Array:
     """Return squared lengths (...) of vectors (..., k), k >= 1.
 
@@ -135,7 +142,7 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
         q[i] = 1.0 + 2.0 * diagonal[i] - trace
         q[j] = r[j][i] + r[i][j]
         q[k] = r[k][i] + r[i][k]
-    norm = math.sqrt(np.dot(q, q))
+    norm = math.hypot(*q)
     x, y, z, w = (term / norm if q[3] >= 0.0 else -(term / norm) for term in q)
     return x, y, z, w
 
@@ -162,26 +169,33 @@ def rotation_vector(q: ArrayLike) -> Array:
     return turn
 
 
-# Cosine of half the angle of a short arc: below 2 mrad the chord is exact to 1e-10 and avoids 0/0.
-_SHORT_ARC = 0.9999995
+# Cosine of half the angle of a short arc: below 2 mrad the chord is exact to 1e-10. Half the angle (rad) that gives it.
+_SHORT_ARC, _CHORD_RAD = 0.9999995, 1e-8
 
 
 def slerps(q0: Array, q1: Array, fraction: Array) -> Array:
     """Interpolate N pairs of unit quaternions (N, 4) spherically along the shorter arc.
 
-    fraction: (N,) in 0..1. nan where either is nan.
+    fraction: (N,) in 0..1. nan where either is nan. Fastest if the columns are contiguous.
     """
     a, b = q0.T, q1.T
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-    sign = np.where(dot >= 0.0, 1.0, -1.0)
-    dot = np.minimum(np.abs(dot), 1.0)
-    angle = np.arccos(np.where(dot > _SHORT_ARC, 0.0, dot))
+    size = np.minimum(np.abs(dot), 1.0)
+    angle = np.where(size > _SHORT_ARC, _CHORD_RAD, np.arccos(size))
     sine = np.sin(angle)
-    w0 = np.where(dot > _SHORT_ARC, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / sine)
-    w1 = sign * np.where(dot > _SHORT_ARC, fraction, np.sin(fraction * angle) / sine)
-    mixed = q0 * w0[:, None] + q1 * w1[:, None]
-    unit: Array = mixed / np.sqrt(squared(mixed))[:, None]
-    return unit
+    w0 = np.sin((1.0 - fraction) * angle) / sine
+    w1 = np.sin(fraction * angle) / np.copysign(sine, dot)
+    mixed = a * w0 + b * w1
+    unit: Array = mixed / np.sqrt(squared(mixed.T))
+    return unit.T
+
+
+def turned_back(q: Array, vectors: Array) -> Array:
+    """Return ``rotation.T @ v`` (3, N) of vectors (3, N) for the rotations of unit quaternions (N, 4)."""
+    axis, cosine = q.T[:3], q.T[3]
+    twice = 2.0 * cross_columns(vectors, axis)
+    turned: Array = vectors + cosine * twice + cross_columns(twice, axis)
+    return turned
 
 
 def attitude_enu_flu_from_ned_frd(rpy: ArrayLike) -> Array:
@@ -207,13 +221,15 @@ def nearest_rotation(products: Array) -> Array:
 
 def turn_between(before: Array, after: Array) -> Array:
     """Return axis times angle (3,) rad of the rotation between two mountings (3, 3), about body axes."""
-    return rotation_vector(quaternion_from_rotation(after @ before.T))
+    *axis, cosine = quaternion_from_rotation(after @ before.T)
+    sine = math.hypot(*axis)
+    return np.array(axis) * (2.0 * math.atan2(sine, cosine) / sine if sine > 1e-12 else 2.0)
 
 
 def rotation_of(vector: Array) -> Array:
     """Return the rotation (3, 3) of axis times angle (3,) rad, by the formula of Rodrigues."""
-    angle = float(np.linalg.norm(vector))
+    angle = math.hypot(*vector)
     if angle == 0.0:
         return np.eye(3)
     k = skew(np.asarray(vector) / angle)
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k)
+    return np.asarray(np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * k @ k)

@@ -21,7 +21,7 @@ from ..numerics.samples import VelocityFrame
 from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
 from ..streams.interpolation import GAP_S, attitude_at
 from .gauss_newton import ARM, FULL_ROWS, QUICK_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
-from .motion_streams import Curves, MotionStreams
+from .motion_streams import MotionStreams
 from .registration import INDEPENDENT_S, LOG_GAIN, Registration
 from .unregistrable_clocks import MOVING_MPS
 
@@ -133,7 +133,7 @@ def fitting_configuration(
         directions.add((motion.dvl.velocity @ nominal.T)[known], rotation[known])
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
-    curves, misfit_as_given = Curves(motion), 1.0
+    misfit_as_given = 1.0
     if registration is not None:
         angle = _significant_angle(registration.rotation_body_from_dvl, nominal, registration.turn_std)
         misfit_as_given = _misfit_with(registration.residual, registration.scale, angle)
@@ -142,10 +142,12 @@ def fitting_configuration(
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
         max_ratio = min(MAX_SIGN_RATIO, math.exp(LOG_GAIN / (3.0 * max(independent, 1.0))))
         level = max_ratio * registration.spread
-        return wrong_axes(motion, curves, nominal, lever_arm, level, parameters.dvl_axes, SIGNS)
+        return wrong_axes(motion, nominal, lever_arm, level, parameters.dvl_axes, SIGNS)
     fits = {}
     for frame in _FRAMES:
-        in_frame = _fit_in_frame(MotionFit(_as_if(motion, declared, frame), lever_arm, curves, QUICK_ROWS), nominal)
+        in_frame = _fit_in_frame(
+            MotionFit(_as_if(motion, declared, frame), lever_arm, motion.curves, QUICK_ROWS), nominal
+        )
         if in_frame is not None:
             fits[frame] = in_frame
     if not fits:
@@ -155,7 +157,7 @@ def fitting_configuration(
     fit = fits[best].fit
     if fit.residual > min(FITS_BELOW, BETTER_BY * min(misfit_as_given, 1.0)):
         return None
-    wrong = wrong_axes(motion, curves, nominal, lever_arm, fit.level, parameters.dvl_axes)
+    wrong = wrong_axes(motion, nominal, lever_arm, fit.level, parameters.dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
     return _configuration_finding(declared, best, fit.rotation_body_from_dvl, parameters, fits[best].also_turned)
@@ -230,7 +232,6 @@ def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame)
 
 def wrong_axes(
     motion: MotionStreams,
-    curves: Curves,
     nominal: Array,
     lever_arm: Array,
     most: float,
@@ -247,11 +248,11 @@ def wrong_axes(
     ahead = int(np.argmax((motion.dvl.velocity**2).sum(axis=0)))
     others = [axis for axis in range(3) if axis != ahead]
     all_signs = [pattern[np.argsort([ahead, *others])] for pattern in patterns]
-    best = _best_signs(motion, curves, nominal, lever_arm, all_signs, FAR_ABOVE * MAX_QUICK_RATIO * most)
+    best = _best_signs(motion, nominal, lever_arm, all_signs, FAR_ABOVE * MAX_QUICK_RATIO * most)
     if best is None:
         return None
     signs = best.signs
-    fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FULL_ROWS)
+    fit = MotionFit(_signed(motion, signs), lever_arm, motion.curves.signed(signs), FULL_ROWS)
     fitted = fit(0.0, best.fit.dvl_delay_s, nominal, (REFERENCE,))
     if fitted is None:
         return None
@@ -288,7 +289,7 @@ class _SignFit(NamedTuple):
 
 
 def _best_signs(
-    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, all_signs: Sequence[Array], most: float
+    motion: MotionStreams, nominal: Array, lever_arm: Array, all_signs: Sequence[Array], most: float
 ) -> _SignFit | None:
     """Return the signs that fit best near the nominal mounting (3, 3), or None.
 
@@ -296,7 +297,7 @@ def _best_signs(
     """
     best: _SignFit | None = None
     for signs in all_signs:
-        quick_rows = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), QUICK_ROWS)
+        quick_rows = MotionFit(_signed(motion, signs), lever_arm, motion.curves.signed(signs), QUICK_ROWS)
         fit = nearest(quick_rows, nominal, (REFERENCE,), most if best is None else min(most, best.fit.level))
         if fit is None:
             continue

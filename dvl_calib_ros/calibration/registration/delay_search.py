@@ -11,10 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..numerics.frames import Array
+from ..numerics.frames import Array, squared, turned_back
 from ..numerics.robust import median
-from ..streams.interpolation import REACH_INTERVALS, attitude_at, linear_at
+from ..streams.interpolation import REACH_INTERVALS, linear_at, quaternion_at
 from .motion_streams import MotionStreams
 
 # Largest searched delay, s.
@@ -30,20 +31,15 @@ MIN_OVERLAP, MIN_OVERLAP_S = 0.4, 20.0
 SEPARATION_S, N_CANDIDATES = 2.0, 4
 
 
+Spectra = NDArray[np.complex128]
+
+
 class DelayPair(NamedTuple):
     """Candidate delays of reference and DVL relative to the IMU, s. misfit: share of the squares left."""
 
     reference: float
     dvl: float
     misfit: float
-
-
-class _Series(NamedTuple):
-    """Stream on the grid: values (N, 3), known (N,) 0 or 1, squares (N,) of the values; zero where unknown."""
-
-    values: Array
-    known: Array
-    squares: Array
 
 
 def candidate_delays(motion: MotionStreams, rotation_body_from_dvl: Array | None) -> list[DelayPair]:
@@ -79,18 +75,10 @@ def _minima(misfit: Array, by_reference: Array, by_dvl: Array, count: int) -> li
     return found
 
 
-class _Misfits(NamedTuple):
-    """Delays (L,) s, and the misfit by reference delay (rows) and DVL delay, (L, L).
+def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Array]:
+    """Return all delays (L,) s up to `FARTHEST_S`, and the misfit by reference delay (rows) and DVL delay, (L, L).
 
-    (1, L) if only the DVL delay is observable.
-    """
-
-    delays: Array
-    misfit: Array
-
-
-def _misfits(motion: MotionStreams, rotation: Array | None) -> _Misfits:
-    """Return the misfit at all pairs of delays up to `FARTHEST_S`; inf where too little overlaps.
+    The misfit is (1, L) if only the DVL delay is observable, and inf where too little overlaps.
 
     rotation: (3, 3) rotation_body_from_dvl of the prior mounting, None to estimate it at each pair.
     """
@@ -100,64 +88,48 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> _Misfits:
     dvl = _on_grid(motion.dvl.times, motion.dvl.velocity, grid, step)
     reference = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
     size = 1 << (len(grid) + 2 * max_shift - 1).bit_length()
-    dvl_spectra = _spectra(dvl, size)
-    min_count = max(MIN_OVERLAP * min(dvl.known.sum(), reference.known.sum()), MIN_OVERLAP_S / step)
+    dvl_spectra = np.fft.rfft(dvl, size)
+    if rotation is not None:
+        dvl_spectra[:3] = rotation @ dvl_spectra[:3]
+    min_count = max(MIN_OVERLAP * min(dvl[3].sum(), reference[3].sum()), MIN_OVERLAP_S / step)
     attitude: Array | None = None
     if motion.in_earth and motion.has_attitude:
-        attitude, oriented = attitude_at(motion.imu, grid, HOLE_S)
+        attitude, oriented = quaternion_at(motion.imu, grid, HOLE_S)
     shifts = range(-max_shift, max_shift + 1) if attitude is not None else (0,)
-    misfit = np.full((len(shifts), len(delays)), np.inf)
+    misfit = np.empty((len(shifts), len(delays)))
     for row, shift in enumerate(shifts):
         body = _shifted(reference, shift)
         if attitude is not None:
-            known = body.known * oriented
-            values = np.einsum("nji,nj->ni", attitude, body.values) * known[:, None]
-            body = _Series(values, known, body.squares * known)
-        sums = _sums_over_lags(_spectra(body, size), dvl_spectra, rotation, size, max_shift)
-        is_enough = (sums.n_steps >= min_count) & (sums.squares > 0.0)
-        misfit[row, is_enough] = (sums.squares - 2.0 * sums.correlation)[is_enough] / (0.5 * sums.squares[is_enough])
-    return _Misfits(delays, np.maximum(misfit, 0.0))
+            body = np.vstack([turned_back(attitude, body[:3]), body[3:]]) * oriented
+        spectra = np.fft.rfft(body, size), dvl_spectra
+        misfit[row] = _misfit_over_lags(*spectra, rotation is not None, size, max_shift, min_count)
+    return delays, misfit
 
 
-def _spectra(series: _Series, size: int) -> Array:
-    """Return the Fourier transforms (F, 5) of three components, known and squares, padded to `size` steps."""
-    return np.asarray(np.fft.rfft(np.column_stack([series.values, series.known, series.squares]), size, axis=0))
+def _misfit_over_lags(
+    body: Spectra, dvl: Spectra, is_aligned: bool, size: int, max_shift: int, min_count: float
+) -> Array:
+    """Return the misfit of body(t) and dvl(t + lag) for lags up to `max_shift` steps, from their spectra (5, F).
 
-
-class _LagSums(NamedTuple):
-    """Sums over the overlap of body and DVL series at each lag (L,).
-
-    n_steps: number of steps.
-    squares: Σ|B|² + Σ|v|².
-    correlation: tr(C Σ v Bᵀ).
-    """
-
-    n_steps: Array
-    squares: Array
-    correlation: Array
-
-
-def _sums_over_lags(body: Array, dvl: Array, rotation: Array | None, size: int, max_shift: int) -> _LagSums:
-    """Return the sums over body(t) and dvl(t + lag) for lags up to `max_shift` steps, from their spectra (F, 5).
-
-    rotation: (3, 3) C; None for the best one at each lag.
+    is_aligned: the DVL's components are rotated by C; else by the best rotation at each lag. Lags of fewer than
+    `min_count` steps have a misfit of inf.
     """
     conjugate = np.conj(body)
     # count, squares of each where the other is known, then products of the components
-    products = [conjugate[:, i] * dvl[:, j] for i, j in ((3, 3), (3, 4), (4, 3))]
-    if rotation is not None:
-        aligned = conjugate[:, :3] * (dvl[:, :3] @ rotation.T)
-        products.append(aligned.sum(axis=1))
+    products = [conjugate[i] * dvl[j] for i, j in ((3, 3), (3, 4), (4, 3))]
+    if is_aligned:
+        products.append((conjugate[:3] * dvl[:3]).sum(axis=0))
     else:
-        products += [conjugate[:, i] * dvl[:, j] for i in range(3) for j in range(3)]
-    sums = np.fft.irfft(np.array(products), size, axis=1)
-    sums = np.concatenate([sums[:, -max_shift:], sums[:, : max_shift + 1]], axis=1)
-    if rotation is not None:
-        correlation = sums[3]
-    else:
-        # the best orthogonal matrix: either handedness will do for a search
-        correlation = np.linalg.svd(sums[3:].T.reshape(-1, 3, 3), compute_uv=False).sum(axis=1)
-    return _LagSums(sums[0], sums[1] + sums[2], correlation)
+        products += [conjugate[i] * dvl[j] for i in range(3) for j in range(3)]
+    sums = np.fft.irfft(np.array(products), size)
+    n_steps, of_dvl, of_body, *correlations = np.concatenate([sums[:, -max_shift:], sums[:, : max_shift + 1]], axis=1)
+    squares, correlation = of_dvl + of_body, correlations[0]
+    if not is_aligned:  # the best orthogonal matrix: either handedness will do for a search
+        by_lag = np.array(correlations).T.reshape(-1, 3, 3)
+        correlation = np.linalg.svd(by_lag, compute_uv=False).sum(axis=1)
+    is_enough = (n_steps >= min_count) & (squares > 0.0)
+    share = (squares - 2.0 * correlation) / np.where(is_enough, 0.5 * squares, 1.0)
+    return np.where(is_enough, np.maximum(share, 0.0), np.inf)
 
 
 def _grid(motion: MotionStreams) -> tuple[float, Array]:
@@ -168,8 +140,10 @@ def _grid(motion: MotionStreams) -> tuple[float, Array]:
     return step, start + step * np.arange(min(int((end - start) / step) + 1, MAX_STEPS))
 
 
-def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
+def _on_grid(times: Array, values: Array, grid: Array, step: float) -> Array:
     """Return a stream on the grid: means over about one step, linearly interpolated.
+
+    The rows (5, L) are three components, 1 where known, and the sum of squares; all zero where unknown.
 
     times: (N,) s, of values (N, 3). grid: (L,) s, with an interval of `step` s.
     """
@@ -181,24 +155,14 @@ def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
     after = np.clip(np.searchsorted(mean_times, grid), 1, max(len(mean_times) - 1, 1))
     longest_gap = max(HOLE_S, REACH_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
     if len(mean_times) < 2:
-        return _Series(np.zeros((len(grid), 3)), np.zeros(len(grid)), np.zeros(len(grid)))
+        return np.zeros((5, len(grid)))
     is_near = mean_times[after] - mean_times[after - 1] <= longest_gap
     known = ((grid >= mean_times[0]) & (grid <= mean_times[-1]) & is_near).astype(float)
-    values = linear_at(mean_times, means, grid) * known[:, None]
-    return _Series(values, known, (values * values).sum(axis=1))
+    values = linear_at(mean_times, means, grid).T * known
+    return np.vstack([values, known, squared(values.T)])
 
 
-def _shifted(series: _Series, steps: int) -> _Series:
-    """Return the series shifted by steps: x(t + steps)."""
-    if steps == 0:
-        return series
-    moved = []
-    for column in series:
-        out = np.zeros_like(column)
-        if abs(steps) < len(column):
-            if steps > 0:
-                out[:-steps] = column[steps:]
-            else:
-                out[-steps:] = column[:steps]
-        moved.append(out)
-    return _Series(*moved)
+def _shifted(series: Array, steps: int) -> Array:
+    """Return the series (5, N) shifted by steps: x(t + steps), zero beyond its ends."""
+    at = np.arange(series.shape[1]) + steps
+    return series.take(at, axis=1, mode="clip") * ((at >= 0) & (at < len(at)))

@@ -35,7 +35,7 @@ from ..streams.imu_frame import enu_from, quaternion_product
 from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at, linear_at
 from .configuration_check import BETTER_BY, DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, MIN_SPEED_MPS, QUICK_ROWS, REFERENCE, MotionFit, white_noise
-from .motion_streams import Curves, MotionStreams
+from .motion_streams import MotionStreams
 from .unregistrable_clocks import covered
 
 # Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a
@@ -148,6 +148,27 @@ class Registered(NamedTuple):
 NOT_REGISTERED = Registered(math.inf, np.eye(3), np.zeros(3), np.full(3, math.inf))
 
 
+class _ImuAsRead(NamedTuple):
+    """IMU under a hypothesis of its axes and world.
+
+    rotation: (N, 3, 3) rotation_enu_from_body at the N compared DVL samples.
+    by_arm: (N, 3) m/s, velocity of the DVL relative to the reference point; (3,) zeros without a lever arm.
+    """
+
+    columns: ImuColumns
+    turns: TurnRates
+    rotation: Array
+    by_arm: Array
+
+
+class _MotionAsRead(NamedTuple):
+    """Motion under a reading, except the DVL. body: (N, 3) m/s, the reference at the DVL's place and samples."""
+
+    motion: MotionStreams
+    imu: _ImuAsRead
+    body: Array
+
+
 class Readings:
     """Comparison of one motion under several readings.
 
@@ -158,7 +179,8 @@ class Readings:
     def __init__(self, motion: MotionStreams, position: Array) -> None:
         """Select the moving DVL samples that have reference and attitude, with the reference at their times."""
         self._motion, self._position = motion, position
-        self._motions: dict[Reading, MotionStreams] = {}
+        self._imus: dict[ImuFrame | None, _ImuAsRead] = {}
+        self._motions: dict[Reading, _MotionAsRead] = {}
         self._fits: dict[Reading, MotionFit] = {}
         times, dvl = motion.dvl
         use = covered(motion.reference_times, times) & (squared(dvl) > MIN_SPEED_MPS**2)
@@ -203,15 +225,10 @@ class Readings:
 
     def _agreement(self, reading: Reading, mounting: Array | None) -> Agreement | None:
         """Compare velocities under a reading; None without its attitude. mounting: rotation_dvl_from_body, if known."""
-        motion = self._read(reading)
-        if motion is None:
+        read = self._read(reading)
+        if read is None:
             return None
-        prior = np.eye(3) if mounting is None else mounting
-        body = linear_at(motion.reference_times, motion.reference, self._at)
-        if motion.in_earth:
-            body = np.einsum("nji,nj->ni", attitude_at(motion.imu, self._at, GAP_S)[0], body)
-        if self._position.any():
-            body = body + np.nan_to_num(cross(angular_velocity_at(motion.turns, self._at, GAP_S), self._position))
+        body, prior = read.body, np.eye(3) if mounting is None else mounting
         dvl = self._dvl @ FLU_FROM_FRD if reading.turned else self._dvl
         speed = _rms(dvl)
         best = best_rotation(dvl, body, prior)
@@ -257,12 +274,12 @@ class Readings:
     def are_axes_mirrored(self, reading: Reading, rotation_found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
         flu_from_dvl = FLU_FROM_FRD if reading.turned else np.eye(3)
-        motion, fit = self._read(reading), self._fit(reading)
+        read, fit = self._read(reading), self._fit(reading)
         rotated = nearest(fit, rotation_found.T @ flu_from_dvl, (REFERENCE,)) if fit else None
-        if motion is None or rotated is None:
+        if read is None or rotated is None:
             return False
         mounting = rotation_dvl_from_body.T @ flu_from_dvl
-        wrong = wrong_axes(motion, Curves(motion), mounting, self._position, rotated.level, FROM_MESSAGE)
+        wrong = wrong_axes(read.motion, mounting, self._position, rotated.level, FROM_MESSAGE)
         return wrong is not None and wrong.code == "DVL_LEFT_HANDED"
 
     def without_roll(self, agreement: Agreement, rotation_dvl_from_body: Array) -> Array:
@@ -274,42 +291,52 @@ class Readings:
 
     def is_in_body(self, agreement: Agreement) -> bool:
         """Return whether DVL and reference are in the body: they also agree if both are in the earth frame."""
-        motion = self._read(replace(agreement.reading, reference=VelocityFrame.ENU.value))
-        if motion is None:
+        read = self._read(replace(agreement.reading, reference=VelocityFrame.ENU.value))
+        if read is None:
             return True
         directions = Directions()
         dvl = self._dvl @ FLU_FROM_FRD if agreement.reading.turned else self._dvl
-        directions.add(dvl @ agreement.rotation_dvl_from_body, attitude_at(motion.imu, self._at, GAP_S)[0])
+        directions.add(dvl @ agreement.rotation_dvl_from_body, read.imu.rotation)
         return directions.stay_in_the_body
 
     def _fit(self, reading: Reading) -> MotionFit | None:
         """Return the least squares of a reading; None if a required attitude is missing."""
-        motion = self._read(reading)
-        if motion is not None and reading not in self._fits:
-            self._fits[reading] = MotionFit(motion, self._position, Curves(motion), QUICK_ROWS)
+        read = self._read(reading)
+        if read is not None and reading not in self._fits:
+            self._fits[reading] = MotionFit(read.motion, self._position, read.motion.curves, QUICK_ROWS)
         return self._fits.get(reading)
 
-    def _read(self, reading: Reading) -> MotionStreams | None:
+    def _read(self, reading: Reading) -> _MotionAsRead | None:
         """Return the motion under a reading, except the DVL; None if a required attitude is missing."""
         key = replace(reading, turned=False)
         if key not in self._motions:
-            m = self._motion
-            imu = m.imu if reading.imu is None else reading.imu.read(m.imu)
-            in_earth = not reading.in_body
+            m, in_earth = self._motion, not reading.in_body
             if in_earth and (reading.imu is None or not m.has_attitude):
                 return None
-            reference = m.reference @ READ_BY[reading.reference].T
-            turned = replace(m, reference=reference, in_earth=in_earth, imu=imu, turns=TurnRates.of(imu))
-            self._motions[key] = turned
+            imu = self._read_imu(reading.imu)
+            reference, body = (velocity @ READ_BY[reading.reference].T for velocity in (m.reference, self._reference))
+            if in_earth:
+                body = np.einsum("nji,nj->ni", imu.rotation, body)
+            motion = replace(m, reference=reference, in_earth=in_earth, imu=imu.columns, turns=imu.turns)
+            self._motions[key] = _MotionAsRead(motion, imu, body + imu.by_arm)
         return self._motions[key]
 
+    def _read_imu(self, frame: ImuFrame | None) -> _ImuAsRead:
+        """Return the IMU under a hypothesis; None for its messages' own axes."""
+        if frame not in self._imus:
+            columns = self._motion.imu if frame is None else frame.read(self._motion.imu)
+            turns, by_arm = TurnRates.of(columns), np.zeros(3)
+            if self._position.any():
+                by_arm = np.nan_to_num(cross(angular_velocity_at(turns, self._at, GAP_S), self._position))
+            self._imus[frame] = _ImuAsRead(columns, turns, attitude_at(columns, self._at, GAP_S)[0], by_arm)
+        return self._imus[frame]
 
-def are_rates_frd(times: Array, reference_rates: Array, imu: ImuColumns, frame: ImuFrame) -> bool | None:
+
+def are_rates_frd(reference_rates: Array, rates: Array) -> bool | None:
     """Return whether turn rates of the reference agree with the IMU as forward-right-down; None if unclear.
 
-    reference_rates: (N, 3) rad/s at times (N,) s. A left turn is positive about an axis up, negative about one down.
+    reference_rates, rates: (N, 3) rad/s. A left turn is positive about an axis up, negative about one down.
     """
-    rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)
     known = np.isfinite(rates).all(axis=1) & np.isfinite(reference_rates).all(axis=1)
     rates, reference_rates = rates[known], reference_rates[known]
     if len(reference_rates) < FEWEST_VALUES or _rms(reference_rates) < MIN_TURN_RADPS or _rms(rates) < MIN_TURN_RADPS:

@@ -6,7 +6,8 @@ With s the stamp of a reference sample, ρ and τ the delays of reference and DV
 
 It is linearised about the last round: δ by the slope of v, ρ by ω × B, because another attitude rotates the reference.
 
-Shapes: J compared references, A measured axes, 9 states.
+Shapes: J compared references, A measured axes, 9 states. References are the last axis: operations on whole rows are
+several times faster.
 """
 
 from __future__ import annotations
@@ -19,11 +20,21 @@ from typing import NamedTuple
 import numpy as np
 
 from ..numerics.block_covariance import TimeBlocks
-from ..numerics.frames import Array, cross, nearest_rotation, rotation_of, skew, squared, turn_between
+from ..numerics.frames import (
+    Array,
+    cross_columns,
+    nearest_rotation,
+    rotation_from_quaternion,
+    rotation_of,
+    squared,
+    turn_between,
+    turned_back,
+    turned_skew,
+)
 from ..numerics.robust import FEWEST_SAMPLES, MEDIAN_SQUARE, median
 from ..numerics.samples import Index, Mask
 from ..numerics.tests import chi2_isf
-from ..streams.interpolation import GAP_S, attitude_at
+from ..streams.interpolation import GAP_S, quaternion_at
 from .motion_streams import Curves, MotionStreams
 
 # States: rotation (rad, body), scale, lever arm (m), delays δ and ρ (s).
@@ -153,10 +164,10 @@ class _AtDelays(NamedTuple):
     """Streams at the times of the J compared references, for delays ρ and δ.
 
     at: (J,) their indices.
-    body: (J, 3) m/s, B.
-    rates: (J, 3) rad/s, ω.
-    velocity: (J, 3) m/s, v, DVL frame, with its slope (J, 3) m/s² and the slope's noise gain (J,).
-    rotation_enu_from_body: (J, 3, 3), zero if not needed.
+    body: (3, J) m/s, B.
+    rates: (3, J) rad/s, ω.
+    velocity: (3, J) m/s, v, DVL frame, with its slope (3, J) m/s² and the slope's noise gain (J,).
+    attitude: (J, 4) quaternions of the body; None for a reference in the body.
     """
 
     at: Index
@@ -165,14 +176,14 @@ class _AtDelays(NamedTuple):
     velocity: Array
     slope: Array
     slope_noise_gain: Array
-    rotation_enu_from_body: Array
+    attitude: Array | None
 
 
 class _Rows(NamedTuple):
     """Residuals linearised about a state, along the A measured axes.
 
-    residual: (J, A) m/s.
-    jacobian: (J, A, 9) by the states.
+    residual: (A, J) m/s.
+    jacobian: (9, A, J) by the states.
     at: (J,) indices of the references.
     delay_noise: (J,) (m/s²)², expected squares of the δ column by DVL noise alone.
     speed: RMS, m/s.
@@ -215,7 +226,7 @@ class MotionFit:
         moving = np.flatnonzero(squared(m.reference) >= MIN_SPEED_MPS**2)
         if len(moving) > most:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
-        self.times, self._velocity = m.reference_times[moving], m.reference[moving]
+        self.times, self._velocity = m.reference_times[moving], m.reference[moving].T.copy()
         self.speed = math.sqrt(float((self._velocity**2).sum()) / max(len(moving), 1))
         # at slow changes, the slope of the velocity is mostly its noise
         self.dvl_noise = float(white_noise(m.dvl.velocity))
@@ -268,8 +279,8 @@ class MotionFit:
             return None
         last = self._solved(x, rows, nominal, rotation, in_time)
         return Fitted(
-            x, rotation, level=last.level, rows=len(rows.at), speed=rows.speed, squares=squared(rows.residual),
-            axes=rows.residual.shape[1], at=rows.at, claims=cache(partial(_claimed, rows, last)),
+            x, rotation, level=last.level, rows=len(rows.at), speed=rows.speed, squares=squared(rows.residual.T),
+            axes=len(rows.residual), at=rows.at, claims=cache(partial(_claimed, rows, last)),
         )  # fmt: skip
 
     def costs(self, x: Array, rotation: Array, level: float) -> tuple[Index, Array]:
@@ -277,7 +288,7 @@ class MotionFit:
         rows = self._rows(x, rotation, None)
         if rows is None:
             return np.zeros(0, dtype=np.intp), np.zeros(0)
-        return rows.at, _robust(squared(rows.residual), rows.residual.shape[1], level)
+        return rows.at, _robust(squared(rows.residual.T), len(rows.residual), level)
 
     def axis_factors(self, fitted: Fitted, nominal: Array) -> AxisFactors:
         """Estimate the scale factor of each DVL axis by least squares about a fit.
@@ -293,38 +304,40 @@ class MotionFit:
         rows, rotation = self._rows(fitted.x, fitted.rotation_body_from_dvl, None), fitted.rotation_body_from_dvl
         if rows is None:
             return AxisFactors(np.ones(3), np.full(3, np.inf), fitted.level)
-        axes = rows.residual.shape[1]
-        weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_WEIGHT_Z**2 * axes * fitted.level**2))
+        axes = len(rows.residual)
+        weight = 1.0 / (1.0 + squared(rows.residual.T) / (HALF_WEIGHT_Z**2 * axes * fitted.level**2))
         nuisance = [*range(N)[TURN], *range(N)[ARM], DELTA]
-        columns = np.concatenate([self._axis_columns(fitted), rows.jacobian[:, :, nuisance]], axis=2)
-        design = columns.reshape(-1, 3 + len(nuisance))
-        weights = np.repeat(weight, axes) / fitted.level**2
+        design = np.concatenate([self._axis_columns(fitted), rows.jacobian[nuisance]]).reshape(3 + len(nuisance), -1)
+        weights = np.tile(weight, axes) / fitted.level**2
         from_prior = fitted.x.copy()
         from_prior[TURN], from_prior[DELTA] = turn_between(nominal, rotation), 0.0
         prior = np.concatenate([np.full(3, FACTOR_STD**-2.0), PRIOR_STD[nuisance] ** -2.0])
-        weighted = (design * weights[:, None]).T
-        information = weighted @ design + np.diag(prior)
-        gradient = -weighted @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[nuisance]])
+        weighted = design * weights
+        information = weighted @ design.T + np.diag(prior)
+        gradient = -(weighted @ rows.residual.ravel()) - prior * np.concatenate([np.zeros(3), from_prior[nuisance]])
         errors = np.linalg.solve(information, gradient)
-        residual = rows.residual.ravel() + design @ errors
+        residual = rows.residual.ravel() + errors @ design
         # residuals that the factors explain are no noise
         share = float((weights * residual**2).sum() / max((weights * rows.residual.ravel() ** 2).sum(), 1e-30))
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
         return AxisFactors(1.0 + errors[:3], std, fitted.level * math.sqrt(share))
 
     def _axis_columns(self, fitted: Fitted) -> Array:
-        """Return the derivative (J, A, 3) m/s of the residuals by the factors of the DVL's axes, see `AxisFactors`.
-
-        The residuals are in the body if all axes are measured, else in the frame of the reference.
-        """
+        """Return the derivative (3, A, J) m/s of the residuals by the factors of the DVL's axes, see `AxisFactors`."""
         compared = self._interpolated(float(fitted.x[RHO]), float(fitted.x[DELTA]))
         assert compared is not None
         # the velocity along each axis of the DVL, in the direction of that axis in the body
-        in_body = -(1.0 + fitted.x[SCALE]) * compared.velocity[:, None, :] * fitted.rotation_body_from_dvl
+        in_body = compared.velocity[:, None] * (-(1.0 + fitted.x[SCALE]) * fitted.rotation_body_from_dvl.T)[:, :, None]
+        return self._measured_part(in_body, compared)
+
+    def _measured_part(self, in_body: Array, compared: _AtDelays) -> Array:
+        """Return vectors (..., 3, J) in the A measured axes: of the body if all, else of the reference's frame."""
         if self._measured.all():
-            return np.asarray(in_body)
-        columns = compared.rotation_enu_from_body @ in_body if self._motion.in_earth else in_body
-        return np.asarray(columns[:, self._measured])
+            return in_body
+        if compared.attitude is None:
+            return np.asarray(in_body[..., self._measured, :])
+        rotation = rotation_from_quaternion(compared.attitude)[:, self._measured].transpose(1, 2, 0).copy()
+        return np.einsum("ijn,...jn->...in", rotation, in_body)
 
     def _interpolated(self, rho: float, delta: float, among: Fitted | None = None) -> _AtDelays | None:
         """Return the streams at delays ρ and δ (s), or None for too few references. among: see `__call__`."""
@@ -333,20 +346,22 @@ class MotionFit:
         if m.in_earth and not m.has_attitude:
             return None
         dvl = self._curves.velocity(self.times + delta)
-        known = dvl.found
-        rotation: Array = np.zeros((len(body_at), 3, 3))
-        if m.in_earth or not all(m.measured):
-            rotation, oriented = attitude_at(m.imu, body_at, GAP_S)
-            known = known & oriented if m.in_earth else known
+        known, attitude = dvl.found, None
+        if m.in_earth:
+            attitude, oriented = quaternion_at(m.imu, body_at, GAP_S)
+            known = known & oriented
         if among is not None:
             known = known & self._shared(among, rho, delta)
-        if np.count_nonzero(known) < FEWEST_SAMPLES:
-            return None
         rows = np.flatnonzero(known)
-        reference_velocity, rotation = self._velocity[rows], rotation[rows]
-        body = np.einsum("nji,nj->ni", rotation, reference_velocity) if m.in_earth else reference_velocity
-        rates = self._curves.rates(body_at[rows])
-        return _AtDelays(rows, body, rates, dvl.value[rows], dvl.slope[rows], dvl.slope_gain[rows], rotation)
+        if len(rows) < FEWEST_SAMPLES:
+            return None
+        # views, without copies, of rows that follow each other
+        at = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] < len(rows) else rows
+        body, rates = self._velocity[:, at], self._curves.rates(body_at[at])
+        if attitude is not None:
+            attitude = attitude[at]
+            body = turned_back(attitude, body)
+        return _AtDelays(rows, body, rates, dvl.value[at].T, dvl.slope[at].T, dvl.slope_gain[at], attitude)
 
     def _shared(self, other: Fitted, rho: float, delta: float) -> Mask:
         """Return which of the used references (J,) share DVL samples and attitudes with another fit."""
@@ -363,29 +378,26 @@ class MotionFit:
         if compared is None:
             return None
         square = float((compared.velocity**2).sum())
-        return nearest_rotation(compared.body.T @ compared.velocity + 1e-3 * square * np.eye(3))
+        return nearest_rotation(compared.body @ compared.velocity.T + 1e-3 * square * np.eye(3))
 
     def _rows(self, x: Array, rotation: Array, among: Fitted | None) -> _Rows | None:
         """Linearise the residuals about a state, in the measured axes; None if too few overlap."""
         compared = self._interpolated(float(x[RHO]), float(x[DELTA]), among)
         if compared is None:
             return None
-        body, rates, rotation_enu_from_body = compared.body, compared.rates, compared.rotation_enu_from_body
-        dvl_in_body = (1.0 + x[SCALE]) * compared.velocity @ rotation.T
-        residual = body + cross(rates, self._lever_arm + x[ARM]) - dvl_in_body
-        jacobian = np.zeros((len(compared.at), 3, N))
-        jacobian[:, :, TURN] = skew(dvl_in_body)
-        jacobian[:, :, SCALE] = -compared.velocity @ rotation.T
-        jacobian[:, :, ARM] = skew(rates)
-        jacobian[:, :, DELTA] = -(1.0 + x[SCALE]) * compared.slope @ rotation.T
-        jacobian[:, :, RHO] = cross(rates, body)
-        if not self._measured.all():
-            if self._motion.in_earth:
-                residual = np.einsum("nij,nj->ni", rotation_enu_from_body, residual)
-                jacobian = rotation_enu_from_body @ jacobian
-            residual, jacobian = residual[:, self._measured], jacobian[:, self._measured]
-        delay_noise = compared.slope_noise_gain * self.dvl_noise * residual.shape[1]
-        speed = float(np.sqrt(squared(body).mean()))
+        body, rates = compared.body, compared.rates
+        through = (1.0 + x[SCALE]) * rotation
+        dvl_in_body = through @ compared.velocity
+        jacobian: Array = np.empty((N, 3, len(compared.at)))
+        jacobian[TURN] = turned_skew(-np.eye(3), dvl_in_body)  # the transpose of skew(a) is -skew(a)
+        jacobian[SCALE] = -rotation @ compared.velocity
+        jacobian[ARM] = turned_skew(-np.eye(3), rates)
+        jacobian[DELTA] = -through @ compared.slope
+        jacobian[RHO] = cross_columns(rates, body)
+        residual = body + cross_columns(rates, self._lever_arm + x[ARM]) - dvl_in_body
+        residual, jacobian = (self._measured_part(vectors, compared) for vectors in (residual, jacobian))
+        delay_noise = compared.slope_noise_gain * self.dvl_noise * len(residual)
+        speed = float(np.sqrt(squared(body.T).mean()))
         return _Rows(residual, jacobian, compared.at, delay_noise, speed)
 
     def _solved(self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]) -> _Step:
@@ -393,22 +405,20 @@ class MotionFit:
 
         nominal, rotation: (3, 3) rotation_body_from_dvl of the prior and of the state. in_time: see `__call__`.
         """
-        axes = rows.residual.shape[1]
-        squares = squared(rows.residual)
+        axes = len(rows.residual)
+        squares = squared(rows.residual.T)
         variance = max(float(median(squares)) / chi2_isf(0.5, axes), 1e-8)
         weight = 1.0 / (1.0 + squares / (HALF_WEIGHT_Z**2 * axes * variance))
-        design = rows.jacobian.reshape(-1, N)
-        weights = np.repeat(weight, axes) / variance
         prior = PRIOR_STD**-2.0
-        weighted = (design * weights[:, None]).T
-        information = weighted @ design + np.diag(prior)
+        weighted = (rows.jacobian * (weight / variance)).reshape(N, -1)
+        information = weighted @ rows.jacobian.reshape(N, -1).T + np.diag(prior)
         # DVL noise in the slope counts as information on δ: subtract it, but less than the marginal information on δ
         marginal = 1.0 / float(np.linalg.inv(information)[DELTA, DELTA])
         information[DELTA, DELTA] -= min(float(weight @ rows.delay_noise) / variance, MAX_NOISE_SHARE * marginal)
         from_prior = x.copy()
         from_prior[TURN] = turn_between(nominal, rotation)
         from_prior[[DELTA, RHO]] = 0.0
-        gradient = -weighted @ rows.residual.ravel() - prior * from_prior
+        gradient = -(weighted @ rows.residual.ravel()) - prior * from_prior
         for constraint in in_time:
             information += HELD_STD_S**-2.0 * np.outer(constraint, constraint)
             gradient -= HELD_STD_S**-2.0 * constraint * float(constraint @ x)
@@ -419,10 +429,11 @@ def _claimed(rows: _Rows, solved: _Step) -> Claimed:
     """Return covariance and σ factors of a solution, inflated for residuals that are correlated in time."""
     p = np.linalg.inv(solved.information)
     blocks = TimeBlocks()
-    for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):
-        h = rows.jacobian[part].reshape(-1, N)
-        w = np.repeat(solved.weight[part], rows.residual.shape[1])[:, None] / solved.level**2
-        blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
+    weighted, n_parts = rows.jacobian * (solved.weight / solved.level**2), min(BLOCKS, max(1, len(rows.at) // 10))
+    columns = (np.array_split(values, n_parts, axis=-1) for values in (rows.jacobian, weighted, rows.residual))
+    for h, w, residual in zip(*columns, strict=True):
+        h, w = h.reshape(N, -1), w.reshape(N, -1)
+        blocks.add((w @ h.T)[None], -(w @ residual.ravel())[None], float(h.shape[1]))
     factor = blocks.inflation(0, np.zeros(N), p, CLOCK_LASTING_Z, None)
     inflation = max(float(factor[[DELTA, RHO]].max()), _correlation_inflation(rows.residual))
     return Claimed(p * np.outer(factor, factor), inflation, factor)
@@ -443,10 +454,10 @@ def white_noise(velocity: Array) -> float:
 
 
 def _correlation_inflation(residual: Array) -> float:
-    """Return the σ factor of the mean of residuals (J, A) over white noise, by their autocorrelation."""
-    n = len(residual)
+    """Return the σ factor of the mean of residuals (A, J) over white noise, by their autocorrelation."""
+    n = residual.shape[1]
     size = 1 << (2 * n - 1).bit_length()
-    power = (np.abs(np.fft.rfft(residual, size, axis=0)) ** 2).sum(axis=1)
+    power = (np.abs(np.fft.rfft(residual, size)) ** 2).sum(axis=0)
     autocorrelation = np.fft.irfft(power, size)[: max(2, n // 8)]
     autocorrelation = autocorrelation / max(float(autocorrelation[0]), 1e-30)
     # up to where the autocorrelation is insignificant

@@ -64,6 +64,11 @@ class MotionStreams:
         """True if there are attitudes to interpolate between."""
         return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
 
+    @cached_property
+    def curves(self) -> Curves:
+        """Smoothed velocity of the DVL and turn rates."""
+        return Curves(self)
+
     def part(self, rows: Index, margin_s: float) -> MotionStreams:
         """Return consecutive references, with DVL and IMU samples within a margin (s) around them."""
         times = self.reference_times[rows]
@@ -166,7 +171,7 @@ class Curves:
         self._step, self._start = max(BIN_S, length_s / MOST_GRID), float(times[0])
         self._grid = self._start + self._step * np.arange(int(length_s / self._step) + 2)
         self._smooth_velocity(motion.dvl)
-        self._turns, self._turns_start = np.zeros((2, 3)), 0.0
+        self._turns, self._turns_start = np.zeros((3, 2)), 0.0
         # near the DVL data only: the grid must not span an arbitrary IMU clock offset
         imu_times = motion.turns.times
         imu_times = imu_times[(imu_times >= times[0] - TURNS_BEYOND_S) & (imu_times <= times[-1] + TURNS_BEYOND_S)]
@@ -174,7 +179,7 @@ class Curves:
             grid = np.arange(imu_times[0], imu_times[-1] + self._step, self._step)
             self._turns_start = float(grid[0])
             rates = [angular_velocity_at(motion.turns, grid[at], GAP_S) for at in _parts(len(grid))]
-            self._turns = np.nan_to_num(np.concatenate(rates))
+            self._turns = np.nan_to_num(np.concatenate(rates).T.copy())
 
     def _smooth_velocity(self, dvl: DvlColumns) -> None:
         """Fit velocity (m/s), slope (m/s²) and the slope's noise gain at the grid, over a reach (s) by the spacing."""
@@ -183,13 +188,14 @@ class Curves:
         usual = REACH_INTERVALS * float(median(np.diff(dvl.times)))
         reach[np.isnan(reach)] = max(LEAST_SLOPE_REACH_S, min(usual, MOST_REACH_S))
         fits = [local_fit(dvl.times, dvl.velocity, self._grid[at], reach[at]) for at in _parts(len(self._grid))]
-        self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
+        columns = [np.vstack([fit.value.T, fit.slope.T, fit.slope_gain]) for fit in fits]
+        self._velocity = np.concatenate(columns, axis=1)
         self._found = np.concatenate([fit.found for fit in fits])
 
     def signed(self, signs: Array) -> Curves:
         """Return the curves of a DVL with these axis signs (3,)."""
         made = copy(self)
-        made._velocity = self._velocity * np.concatenate([signs, signs, [1.0]])
+        made._velocity = self._velocity * np.concatenate([signs, signs, [1.0]])[:, None]
         return made
 
     def velocity(self, at: Array) -> LocalFit:
@@ -197,18 +203,18 @@ class Curves:
         before, share, inside = self._places(at, self._start, len(self._grid))
         columns = _between(self._velocity, before, share)
         found = inside & self._found[before] & self._found[before + 1]
-        return LocalFit(columns[:, :3], columns[:, 3:6], columns[:, 6], found)
+        return LocalFit(columns[:3].T, columns[3:6].T, columns[6], found)
 
     def rates(self, at: Array) -> Array:
-        """Return angular rates (J, 3) rad/s at times (J,) s, zero where unknown."""
-        before, share, inside = self._places(at, self._turns_start, len(self._turns))
-        return np.where(inside[:, None], _between(self._turns, before, share), 0.0)
+        """Return angular rates (3, J) rad/s at times (J,) s, zero where unknown."""
+        before, share, inside = self._places(at, self._turns_start, self._turns.shape[1])
+        return np.where(inside, _between(self._turns, before, share), 0.0)
 
     def _places(self, at: Array, start: float, n: int) -> tuple[Index, Array, Mask]:
-        """Return the grid point before each time (J,) s, the share of a step beyond it (J, 1), and whether inside."""
+        """Return the grid point before each time (J,) s, the share of a step beyond it (J,), and whether inside."""
         place = (at - start) / self._step
-        before = np.clip(place, 0, n - 2).astype(np.intp)
-        return before, (place - before)[:, None], (place >= 0.0) & (place <= n - 1)
+        before = np.minimum(np.maximum(place, 0), n - 2).astype(np.intp)
+        return before, place - before, (place >= 0.0) & (place <= n - 1)
 
 
 def _parts(n: int) -> list[slice]:
@@ -217,9 +223,9 @@ def _parts(n: int) -> list[slice]:
 
 
 def _between(values: Array, before: Index, share: Array) -> Array:
-    """Interpolate rows linearly between index `before` and the next, at a share (0..1)."""
-    before_value = values.take(before, axis=0)
-    values_at: Array = values.take(before + 1, axis=0)
+    """Interpolate columns linearly between index `before` and the next, at a share (0..1)."""
+    before_value = values.take(before, axis=1)
+    values_at: Array = values.take(before + 1, axis=1)
     values_at -= before_value
     values_at *= share
     values_at += before_value

@@ -38,7 +38,7 @@ from .gauss_newton import (  # fmt: skip
     MotionFit,
     N,
 )
-from .motion_streams import Curves, MotionStreams
+from .motion_streams import MotionStreams
 
 # Chi-square that each additional delayed clock must gain.
 GAIN_PER_CLOCK = 12.0
@@ -215,13 +215,12 @@ def _registered(
     motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, *, are_clocks_steady: bool
 ) -> Registration | None:
     """Register a motion, see `register`. are_clocks_steady: skip the search for a clock change."""
-    curves = Curves(motion)
-    full, quick = (MotionFit(motion, lever_arm, curves, most) for most in (FULL_ROWS, QUICK_ROWS))
+    full, quick = (MotionFit(motion, lever_arm, motion.curves, most) for most in (FULL_ROWS, QUICK_ROWS))
     likeliest = _fit_at_likeliest_delays(motion, quick, rotation_body_from_dvl)
     if likeliest is None:
         return None
     if not are_clocks_steady and likeliest.inflation > STEADY_INFLATION:
-        change = _change(motion, curves, lever_arm, rotation_body_from_dvl)
+        change = _change(motion, lever_arm, rotation_body_from_dvl)
         if change is not None:
             changed = _with_change_corrected(motion, full, change, rotation_body_from_dvl, lever_arm)
             # several delays fit each stretch in waves; a real clock change lowers the total residual
@@ -252,7 +251,7 @@ def _with_steady_clocks(
     likeliest: quick fit at the likeliest delays.
     """
     in_sync = _fit_in_sync(quick, likeliest, rotation)
-    start = likeliest
+    start, held = likeliest, None
     if in_sync.chi2 < IN_SYNC_CHI2:
         explained = _fewest_delayed_clocks(quick, likeliest, in_sync, rotation, lever_arm)
         if not explained.left_open.any():
@@ -260,13 +259,15 @@ def _with_steady_clocks(
         free = _refitted(full, likeliest, rotation)
         if free is None:
             return explained
-        if _fit_in_sync(full, free, rotation).chi2 < IN_SYNC_CHI2:  # only σ of the reference clock changes
+        in_sync = _fit_in_sync(full, free, rotation)
+        if in_sync.chi2 < IN_SYNC_CHI2:  # only σ of the reference clock changes
             return replace(explained, **_reference_clock(full, free, 0.0, rotation))
-        start = free
+        start, held = free, in_sync.fit
     free = _refitted(full, start, rotation)
     if free is None:
         return None
-    return _fewest_delayed_clocks(full, free, _fit_in_sync(full, free, rotation), rotation, lever_arm)
+    in_sync = _fit_in_sync(full, free, rotation) if held is None else _compared(held, free)
+    return _fewest_delayed_clocks(full, free, in_sync, rotation, lever_arm)
 
 
 def _refitted(fit: MotionFit, start: Fitted, rotation: Array | None) -> Fitted | None:
@@ -292,8 +293,8 @@ def _fit_at_likeliest_delays(motion: MotionStreams, quick: MotionFit, rotation: 
     return min(as_good, key=lambda fit: abs(fit.x[RHO]) + abs(fit.dvl_delay_s))
 
 
-def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
-    """Return the clock drift or step between stretches of a motion, or None. curves: of the whole motion."""
+def _change(motion: MotionStreams, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
+    """Return the clock drift or step between stretches of a motion, or None."""
     times = motion.reference_times
     n_stretches = min(int((times[-1] - times[0]) / STRETCH_S), MAX_STRETCHES)
     if n_stretches < 2:
@@ -301,7 +302,9 @@ def _change(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: A
     mean_times, fits = [], []
     for rows in np.array_split(np.arange(len(times)), n_stretches):
         stretch = motion.part(rows, FARTHEST_S)
-        best = _fit_at_likeliest_delays(stretch, MotionFit(stretch, lever_arm, curves, ROWS_OF_STRETCH), rotation)
+        best = _fit_at_likeliest_delays(
+            stretch, MotionFit(stretch, lever_arm, motion.curves, ROWS_OF_STRETCH), rotation
+        )
         if best is not None:
             mean_times.append(float(times[rows].mean()))
             fits.append(best)
@@ -402,8 +405,11 @@ def _fit_in_sync(
     penalty: chi-square added.
     """
     held = fit(rho, delta, rotation, held_clocks)
-    if held is None or not _is_possible(held):
-        return _HeldFit(None, math.inf)
+    return _HeldFit(None, math.inf) if held is None or not _is_possible(held) else _compared(held, free, penalty)
+
+
+def _compared(held: Fitted, free: Fitted, penalty: float = 0.0) -> _HeldFit:
+    """Compare a fit with synchronised clocks with the fit `free`. penalty: see `_fit_in_sync`."""
     # the number of compared samples depends on the delays
     grown = held.cost(free.level, held.at) * free.rows / held.rows - free.cost(free.level, free.at)
     grown /= free.inflation**2

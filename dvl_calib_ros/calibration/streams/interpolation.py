@@ -156,7 +156,13 @@ def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody
 
 
 def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
-    """Return ``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and a validity mask (J,).
+    """Return ``rotation_enu_from_body`` (J, 3, 3), and a validity mask (J,), see `quaternion_at`."""
+    quaternion, known = quaternion_at(imu, times, gap_s)
+    return rotation_from_quaternion(quaternion), known
+
+
+def quaternion_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
+    """Return attitudes (J, 4) by spherical interpolation, and a validity mask (J,).
 
     gap_s: longest interpolated gap.
     """
@@ -165,12 +171,12 @@ def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mas
     if not is_given.all():
         stamps, quaternions = stamps[is_given], quaternions[is_given]
     if len(stamps) < 2:
-        return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
+        return np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1)), np.zeros(len(times), dtype=bool)
     after, before, outside = _neighbours(stamps, times)
     gap = np.maximum(stamps[after] - stamps[before], 1e-12)
     fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
-    interpolated = slerps(quaternions.take(before, axis=0), quaternions.take(after, axis=0), fraction)
-    return rotation_from_quaternion(interpolated), ~outside & (gap <= gap_s)
+    start, end = (np.asfortranarray(quaternions.take(index, axis=0)) for index in (before, after))
+    return slerps(start, end, fraction), ~outside & (gap <= gap_s)
 
 
 # Fewest samples on each side of a fit: with fewer it extrapolates.

@@ -331,7 +331,7 @@ def test_a_scale_of_one_axis_is_judged_by_the_residual_with_that_scale():
         for z in (1.0, 0.5)
     )
     level = MotionFit(right, np.zeros(3), Curves(right))(0.0, 0.0, np.eye(3), (REFERENCE,)).level
-    wrong = wrong_axes(half, Curves(half), np.eye(3), np.zeros(3), 1.01 * level, "from_message", SIGNS)
+    wrong = wrong_axes(half, np.eye(3), np.zeros(3), 1.01 * level, "from_message", SIGNS)
     assert wrong is not None and wrong.code == "DVL_AXIS_SCALED"
     assert wrong.numbers["factor"] == pytest.approx(0.5, abs=0.05)
 
