@@ -97,6 +97,10 @@ def test_two_late_clocks_are_told_apart(seconds):
     assert found.dvl.is_shown and found.reference.is_shown
     assert found.dvl.delay_s == pytest.approx(dvl, abs=max(0.1, 4.0 * found.dvl.std))
     assert found.reference.delay_s == pytest.approx(reference, abs=max(0.1, 4.0 * found.reference.std))
+    said = found.contradiction(Parameters())
+    assert said is not None and said.code == "CLOCKS_LATE"
+    assert said.numbers["dvl_way"] == ("early" if dvl < 0.0 else "late")
+    assert (said.numbers["seconds"], said.numbers["dvl_seconds"]) == pytest.approx((reference, abs(dvl)), abs=0.1)
 
 
 @pytest.mark.parametrize("seconds", [-0.6, 0.5, 4.0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from runs import MatchedRun, feed, feed_columns, make_samples
+from runs import MatchedRun, feed, feed_columns, make_samples, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.estimator import AtOnce
@@ -32,10 +32,7 @@ def test_of_many_numbers_every_so_many_th_is_kept(sizes):
 def test_live_clocks_that_are_apart_are_named_as_by_a_replay(seconds, given):
     """Nothing was paired then, so nothing verified, and nothing said beside that no data had come."""
     samples = make_samples(MatchedRun("straight", 60.0, imu_every=50))
-    stamped = [
-        each._replace(stamp_ns=each.stamp_ns + seconds * 10**9) if isinstance(each, ReferenceSample) else each
-        for each in samples
-    ]
+    stamped = shifted(samples, seconds * 10**9, ReferenceSample)
     calibrator = Calibrator(Parameters(), worker=AtOnce())
     assert calibrator.doubts_so_far == []
     given(calibrator, stamped)
@@ -49,11 +46,7 @@ def test_live_clocks_are_compared_again_only_where_something_came(monkeypatch):
     """Diagnostics ask twice a second, also of a vehicle whose instruments are off."""
     asked = []
     monkeypatch.setattr(clock_domains, "median", lambda ahead: asked.append(len(ahead)) or float(np.median(ahead)))
-    samples = make_samples(MatchedRun("straight", 60.0, imu_every=50))
-    late = [
-        each._replace(stamp_ns=each.stamp_ns + 18 * 10**9) if isinstance(each, ReferenceSample) else each
-        for each in samples
-    ]
+    late = shifted(make_samples(MatchedRun("straight", 60.0, imu_every=50)), 18 * 10**9, ReferenceSample)
     calibrator = feed(Calibrator(Parameters(), worker=AtOnce()), late[:-20])
     said = calibrator.doubts_so_far
     looks = len(asked)
