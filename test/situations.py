@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from log_fixtures import general_nmea, pd0, sentence
+from log_fixtures import ensemble, general_nmea, sentence
 from scipy.spatial.transform import Rotation
 from stacks import FIX, GNSS_STD, IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, true_mounting
 
@@ -30,8 +30,7 @@ DVL, REFERENCE = "/dvl/velocity", "/gnss/velocity"
 KNOTS_PER_MPS = 1.0 / 0.514444
 # The surface before and after a dive, s.
 SURFACE_S = 60.0
-# Instrument coordinates, tilts used (EX of an ensemble).
-EX_INSTRUMENT = 0b01111
+INSTRUMENT_AXES, TILTS_USED = 1, 0b111  # EX of an ensemble
 SHIP_MPS, BED_MPS = 0.03, (0.10, 0.066, 0.0)
 
 
@@ -223,19 +222,15 @@ def ensembles(path: Path, yaw_deg: float = 0.0, bed_mps: Array | None = None) ->
         heading = math.degrees(math.atan2(enu_from_body[0, 0], enu_from_body[1, 0])) % 360.0
         east, north, _ = enu_from_body @ m.velocity_body[i] + rng.normal(0.0, SHIP_MPS, 3)
         course, knots = math.degrees(math.atan2(east, north)) % 360.0, math.hypot(east, north) * KNOTS_PER_MPS
-        written += pd0(
-            i // 10,
-            round(100.0 * heading) % 36000,
-            round(100.0 * tilt),
-            round(100.0 * math.degrees(roll)),
-            [
+        written += ensemble(
+            [round(-1000.0 * each) for each in (-left, ahead, up)] + [3], i, INSTRUMENT_AXES, flags=TILTS_USED,
+            attitude=(round(100.0 * heading) % 36000, round(100.0 * tilt), round(100.0 * math.degrees(roll))),
+            alignment=round(-100.0 * yaw_deg),
+            nmea=[
                 general_nmea(105, sentence(f"GPVTG,{course:.2f},T,,M,{knots:.3f},N,,K"), 0.0),
                 general_nmea(107, sentence(f"GPHDT,{heading:.2f},T"), 0.0),
             ],
-            [round(-1000.0 * each) for each in (-left, ahead, up)] + [3],
-            EX_INSTRUMENT,
-            round(-100.0 * yaw_deg),
-        )
+        )  # fmt: skip
     return imported(path, bytes(written))
 
 

@@ -118,7 +118,7 @@ def test_several_recordings_have_one_water(bag):
 def told(ensemble: bytes, sensors: int) -> bytes:
     """An ensemble of `pd0` with EC 1500 m/s, ES 35, ET 12.1 °C, the last two from these sensors."""
     body = bytearray(ensemble[:-2])
-    fixed, variable = struct.unpack_from("<2H", body, 6)
+    fixed, _, variable = struct.unpack_from("<3H", body, 6)
     body[fixed + 30 : fixed + 32] = bytes([sensors, 0x3F])
     struct.pack_into("<H", body, variable + 14, 1500)
     struct.pack_into("<Hh", body, variable + 24, 35, 1210)

@@ -439,17 +439,6 @@ def test_a_topic_of_another_type_is_named_with_the_option_to_set(tmp_path, capsy
     assert output.err.count("\n") == 1 and expected in output.err
 
 
-def test_a_file_without_permission_is_named_in_one_line(tmp_path, capsys, monkeypatch):
-    bag = write_bag(tmp_path / "bag", run(6.0))
-
-    def denied(path, *_):
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(os, "open", denied)
-    assert main(["replay", str(bag)]) == 2
-    assert "Permission denied" in capsys.readouterr().err
-
-
 def test_a_database_whose_journal_is_lost_gives_what_the_database_holds(tmp_path):
     file = storage_file(write_bag(tmp_path / "bag", run(6.0), "sqlite3"))
     expected = raw(file)
