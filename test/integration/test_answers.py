@@ -101,17 +101,7 @@ def test_a_track_that_gets_worse_is_at_most_marginal_and_said(after, expected):
     none = np.zeros((0, 2))
     found = objections(
         Navigation(
-            900.0,
-            900.0,
-            100.0,
-            8,
-            Drift(9.1, 3.0),
-            Drift(after, 3.0),
-            6.0,
-            True,
-            none[:, 0],
-            none[:, 0],
-            *[none] * 5,
+            900.0, 900.0, 100.0, 8, Drift(9.1, 3.0), Drift(after, 3.0), 6.0, True, none[:, 0], none[:, 0], *[none] * 5
         )
     )
     assert [each.severity for each in found] == expected

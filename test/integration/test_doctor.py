@@ -323,8 +323,7 @@ CLAIMED_RUNS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["harbour_box", "straight_leg", "a figure eight, arm unknown", "a mounting at 45 degrees"],
+    "name", ["harbour_box", "straight_leg", "a figure eight, arm unknown", "a mounting at 45 degrees"]
 )
 @pytest.mark.spread(1)
 def test_the_standard_deviations_are_those_that_the_replay_claims(name, tmp_path):

@@ -419,10 +419,7 @@ def test_what_cannot_be_replayed_is_named_in_one_line_with_exit_code_2(tmp_path,
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (
-            ["--dvl-topic", "imu/data"],
-            "topic imu/data holds sensor_msgs/msg/Imu, expected geo",
-        ),
+        (["--dvl-topic", "imu/data"], "topic imu/data holds sensor_msgs/msg/Imu, expected geo"),
         (["--gnss-topic", "imu/data"], "set --gnss-topic"),
         (["--gnss-topic", "imu/data", "-p", "prior_source:=reference"], "set --gnss-topic"),
         (["--imu-topic", "gnss/twist"], "expected sensor_msgs/msg/Imu; set --imu-topic"),

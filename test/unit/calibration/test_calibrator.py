@@ -252,11 +252,7 @@ def test_auto_does_not_keep_what_few_references_tell():
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        ({}, ("M7", "M3")),
-        ({"gnss_model": "M4", "gnss_free_model": "M5"}, ("M5", "M4")),
-    ],
+    ("given", "expected"), [({}, ("M7", "M3")), ({"gnss_model": "M4", "gnss_free_model": "M5"}, ("M5", "M4"))]
 )
 def test_iac_is_the_published_selection_with_timeout_and_hysteresis(given, expected):
     run = variant(NOISY, seconds=100, gnss_phase=0)

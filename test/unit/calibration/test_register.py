@@ -14,13 +14,7 @@ from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.registration import registration
 from dvl_calib_ros.calibration.registration.configuration_check import SIGNS, fitting_configuration, wrong_axes
 from dvl_calib_ros.calibration.registration.delay_search import FARTHEST_S, _minima, candidate_delays
-from dvl_calib_ros.calibration.registration.gauss_newton import (
-    DELTA,
-    DVL,
-    REFERENCE,
-    RHO,
-    MotionFit,
-)
+from dvl_calib_ros.calibration.registration.gauss_newton import DELTA, DVL, REFERENCE, RHO, MotionFit
 from dvl_calib_ros.calibration.registration.motion_streams import Curves, MotionStreams, make_motion
 from dvl_calib_ros.calibration.registration.registration import (
     Clock,

@@ -350,15 +350,6 @@ def test_replay_writes_a_report_and_keeps_the_old_one(tmp_path, monkeypatch, cap
     assert shown == {"M7", "full"}  # what was asked for, and the selected one
 
 
-def test_a_report_that_cannot_be_written_is_refused_before_the_replay(tmp_path, capsys):
-    bag = write_bag(tmp_path / "bag", run())
-    assert "does not exist" in fail(capsys, "replay", bag, "--report", tmp_path / "none" / "report.html")
-    assert "is a folder" in fail(capsys, "replay", bag, "--report", tmp_path)
-    same = tmp_path / "same"
-    message = fail(capsys, "replay", bag, "--report", same, "--json", same)
-    assert "--report" in message and "--json" in message and not same.exists()
-
-
 def test_without_the_plot_library_the_message_says_what_to_install(tmp_path, capsys, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("dvl_calib_ros.present")]:
         monkeypatch.delitem(sys.modules, name)
