@@ -157,14 +157,24 @@ def test_message_covariances_are_turned_into_the_dvl_frame_and_added():
     parameters = Parameters(mounting_rpy=run.mounting_rpy, gate_probability=0.0)
     calibrator = with_m1(samples, parameters)
     t = parameters.rotation_dvl_from_body
-    r = t @ gnss @ t.T + own  # = diag(0.04, 0.01, 0.09) + own
+    weight = np.linalg.inv(t @ gnss @ t.T + own)  # = diag(0.04, 0.01, 0.09) + own
+
+    def row(velocity, reference):
+        g = t @ reference
+        return np.column_stack([[0, g[2], -g[1]], [-g[2], 0, g[0]], [g[1], -g[0], 0], -g]), g - velocity
+
+    assert_least_squares(calibrator, samples, weight, row)
+
+
+def assert_least_squares(calibrator: Calibrator, samples, weight, row):
+    """M1 is that of weighted least squares with the prior. row: velocity and reference -> H, z."""
     information, right = np.diag([1 / 0.05**2] * 3 + [1 / 0.006**2]), np.zeros(4)
-    references = {s.stamp_ns: s for s in only(samples, ReferenceSample)}
+    references = {s.stamp_ns: s.velocity for s in only(samples, ReferenceSample)}
     for sample in only(samples, DvlSample):
-        g = t @ references[sample.stamp_ns].velocity
-        h = np.column_stack([[0, g[2], -g[1]], [-g[2], 0, g[0]], [g[1], -g[0], 0], -g])
-        information += h.T @ np.linalg.inv(r) @ h
-        right += h.T @ np.linalg.inv(r) @ (g - sample.velocity)
+        if sample.stamp_ns in references:
+            h, z = row(np.array(sample.velocity), np.array(references[sample.stamp_ns]))
+            information += h.T @ weight @ h
+            right += h.T @ weight @ z
     np.testing.assert_allclose(calibrator.state("M1").x, np.linalg.solve(information, right), atol=1e-12)
     np.testing.assert_allclose(calibrator.state("M1").p, np.linalg.inv(information), atol=1e-12)
 
@@ -576,19 +586,12 @@ def test_the_axes_that_are_measured_give_the_information_that_two_rows_have():
     """M1 in the body frame, mounted straight: weighted least squares on the horizontal rows alone."""
     samples = with_vertical(make_samples(variant(NOISY, gnss_phase=0)), lambda i: 0.3, HORIZONTAL)
     calibrator = calibrate(samples, Parameters(gate_probability=0.0))
-    information, right = np.diag([1 / 0.05**2] * 3 + [1 / 0.006**2]), np.zeros(4)
-    references = {s.stamp_ns: s for s in only(samples, ReferenceSample)}
-    for sample in only(samples, DvlSample):
-        if sample.stamp_ns not in references:
-            continue
-        x, y, _ = references[sample.stamp_ns].velocity
-        z = sample.velocity[2]  # the best that is known of it
-        h = np.array([[0.0, -z, y, -x], [z, 0.0, -x, -y]])
-        weight = 1.0 / (0.01 + 0.025**2)
-        information += weight * h.T @ h
-        right += weight * h.T @ (np.array([x, y]) - sample.velocity[:2])
-    np.testing.assert_allclose(calibrator.state("M1").x, np.linalg.solve(information, right), atol=1e-12)
-    np.testing.assert_allclose(calibrator.state("M1").p, np.linalg.inv(information), atol=1e-12)
+
+    def row(velocity, reference):
+        (x, y, _), z = reference, velocity[2]  # the best that is known of it
+        return np.array([[0.0, -z, y, -x], [z, 0.0, -x, -y]]), reference[:2] - velocity[:2]
+
+    assert_least_squares(calibrator, samples, np.eye(2) / (0.01 + 0.025**2), row)
 
 
 def test_a_vertical_velocity_of_exactly_zero_does_not_count_until_one_is_not():

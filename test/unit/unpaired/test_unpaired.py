@@ -98,10 +98,7 @@ def test_the_effect_that_the_simulator_lacks_is_named_with_its_size_on_both_side
     assert arm.simulator["x_m"][1] < 0.0 < arm.simulator["x_m"][2]
     assert arm.p < 0.01 and arm.lies is not None and "lever_arm" in compared.sentence
     assert [each.code for each in compared.reasons][:2] == ["SIMULATOR_LACKS", "SIMULATOR_PUT_RIGHT"]
-
-
-@pytest.mark.slow
-def test_a_misalignment_is_no_difference_of_effects_since_calibration_takes_it_in(compared):
+    # a misalignment is none, since calibration takes it in
     assert [each.name for each in compared.effects if each.status.is_claim] == ["lever_arm"]
 
 
