@@ -80,12 +80,17 @@ def run_without_gnss(headings_deg, current_enu, misalignment, rng, trim=0.0, sec
         heading = np.deg2rad(headings_deg[i // seconds_each])
         rotation = rotation_from_rpy((0.0, -trim, heading))
         east, north = 1.5 * np.cos(heading) + current_enu[0], 1.5 * np.sin(heading) + current_enu[1]
-        velocity_body = rotation.T @ np.array([east, north, 0.0])
-        velocity_body = velocity_body + rng.normal(0, 0.01, 3)
-        measured = velocity_body + np.cross(misalignment, velocity_body)
-        samples.append(ImuSample(i * SECOND, quaternion_from_rotation(rotation), (0.0, 0.0, 0.0)))
-        samples.append(DvlSample(i * SECOND, tuple(measured.tolist())))
+        samples += seen(i, rotation, rotation.T @ np.array([east, north, 0.0]), misalignment, rng)
     return samples
+
+
+def seen(second: int, rotation, velocity_body, misalignment, rng):
+    """The samples of IMU and DVL at a time."""
+    velocity = velocity_body + rng.normal(0, 0.01, 3)
+    measured = velocity + np.cross(misalignment, velocity)
+    orientation = quaternion_from_rotation(rotation)
+    stamp_ns = second * SECOND
+    return ImuSample(stamp_ns, orientation, (0.0, 0.0, 0.0)), DvlSample(stamp_ns, tuple(measured.tolist()))
 
 
 def test_two_headings_tell_yaw_from_a_current(rng):
@@ -112,10 +117,7 @@ def run_through_a_shear(misalignment, rng):
         rising = 0.25 * (1.0 if i // 50 % 4 in (0, 3) else -1.0) * (i // 100 % 4 < 2 or i // 50 % 2)
         height += rising
         rotation = rotation_from_rpy((0.0, -np.arcsin(rising / 1.5), heading))
-        velocity_body = rotation.T @ (0.0, 0.01 * height, 0.0) + (1.5, 0.0, 0.0) + rng.normal(0, 0.01, 3)
-        measured = velocity_body + np.cross(misalignment, velocity_body)
-        samples.append(ImuSample(i * SECOND, quaternion_from_rotation(rotation), (0.0, 0.0, 0.0)))
-        samples.append(DvlSample(i * SECOND, tuple(measured.tolist())))
+        samples += seen(i, rotation, rotation.T @ (0.0, 0.01 * height, 0.0) + (1.5, 0.0, 0.0), misalignment, rng)
     return samples
 
 
@@ -181,11 +183,6 @@ def test_an_imu_that_starts_late_changes_little(rng):
     whole, part = (calibrate(each, Parameters(current_std=0.3)).estimate("unaided") for each in (samples, late))
     assert part.used == whole.used
     assert part.misalignment[2] == pytest.approx(0.04, abs=0.006)
-
-
-def test_with_gnss_auto_runs_full():
-    segments = calibrate(make_samples(MatchedRun("box", 120.0, gnss_std=0.05))).selection.segments
-    assert [segment.model for segment in segments] == ["unaided", "full"]
 
 
 def test_unaided_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
