@@ -442,9 +442,9 @@ def test_intervals_hold_what_they_say_over_40_runs():
 
 
 @cache
-def late_reference():
-    """A run whose reference is late by 0.6 s, and what is made of it; not to be fed any more."""
-    samples = sorted(shifted(late(0.0), 600_000_000, ReferenceSample), key=lambda sample: sample.stamp_ns)
+def late_reference(seconds: float = 0.6):
+    """A run whose reference is late, and what is made of it; not to be fed any more."""
+    samples = sorted(shifted(late(0.0), round(1e9 * seconds), ReferenceSample), key=lambda sample: sample.stamp_ns)
     return samples, calibrate(samples, NOISE, verified=True)
 
 
@@ -468,6 +468,13 @@ def test_what_it_says_makes_the_calibration_right():
     assert calibrator.suggestion is None
     assert calibrator.verification("full").verdict is Severity.ACCEPT
     np.testing.assert_allclose(calibrator.estimate("full").state[5:7], LEVER_ARM[:2], atol=0.1)
+
+
+def test_a_reference_that_is_late_by_more_than_any_delay_of_the_dvl_is_named_as_well():
+    """It was said to be 1.2 s late or more, or nothing."""
+    said = late_reference(30.0)[1].suggestion
+    assert said is not None and said.numbers["parameter"] == "reference_time_offset"
+    assert said.numbers["offset"] == pytest.approx(30.0, abs=0.05)
 
 
 @pytest.mark.slow
