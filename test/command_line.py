@@ -46,6 +46,11 @@ def room_for(size: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, before)
 
 
+def unfit(text: str) -> list[str]:
+    """What must not come to a terminal, each with what is around it."""
+    return [text[max(at - 60, 0) : at + 9] for at, c in enumerate(text) if not c.isprintable() and c not in "\n\t"]
+
+
 def in_fresh_process(statement: str, modules: list[str]) -> list[str]:
     """Which of these modules a statement imports."""
     shown = f"print(*(m for m in {modules} if m in sys.modules))"

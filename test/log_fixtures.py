@@ -62,33 +62,47 @@ def dataflash(path: Path) -> Path:
     return path
 
 
-def pd0(
-    i: int,
-    heading: int,
-    pitch: int,
-    roll: int,
-    nmea: Sequence[bytes] = (),
-    velocity: Sequence[int] = (10, -1500, 0, 0),
-    axes: int = 2 << 3,
+def ensemble(
+    millimetres: Sequence[int],
+    hundredths: int,
+    axes: int = 2,
+    checksum: int = 0,
+    *,
+    configuration: tuple[int, int] = (0, 0),
+    flags: int = 0,
+    attitude: tuple[int, int, int] = (0, 0, 0),
+    length: int = 65,
     alignment: int = 0,
+    nmea: Sequence[bytes] = (),
 ) -> bytes:
-    """An ensemble of each 0.1 s. nmea: what `general_nmea` gives. velocity: mm/s. axes: EX. alignment: EA, 0.01 deg."""
+    """A PD0 ensemble with fixed leader, variable leader and bottom track, by the format's table of bytes.
+
+    hundredths: of a second, since 10:30:15. attitude: heading, pitch, roll, 0.01 degrees, as is alignment (EA).
+    nmea: what `general_nmea` gives.
+    """
     fixed, variable, bottom = bytearray(59), bytearray(65), bytearray(81)
-    fixed[25] = axes
+    fixed[4:6] = bytes(configuration)
+    fixed[25] = axes << 3 | flags
     struct.pack_into("<h", fixed, 26, alignment)
-    minute, hundredths = divmod(1500 + 10 * i, 6000)
+    minute, rest = divmod(1500 + hundredths, 6000)
     struct.pack_into("<H", variable, 0, 0x0080)
-    variable[4:11] = bytes([25, 11, 21, 10, 30 + minute, hundredths // 100, hundredths % 100])
-    struct.pack_into("<H2h", variable, 18, heading, pitch, roll)
+    variable[4:11] = bytes([25, 11, 21, 10, 30 + minute, rest // 100, rest % 100])
+    struct.pack_into("<H2h", variable, 18, *attitude)
     struct.pack_into("<H", bottom, 0, 0x0600)
-    struct.pack_into("<4h", bottom, 24, *velocity)
-    parts = [bytes(fixed), bytes(variable), bytes(bottom), *nmea]
+    struct.pack_into(f"<{len(millimetres)}h", bottom, 24, *millimetres)
+    # of the leaders and bottom track the variable leader last, as `length` cuts it off
+    parts = [bytes(fixed), bytes(bottom), bytes(variable[:length]), *nmea]
     offsets, at = [], 6 + 2 * len(parts)
     for part in parts:
         offsets.append(at)
         at += len(part)
     body = b"\x7f\x7f" + struct.pack(f"<HBB{len(parts)}H", at, 0, len(parts), *offsets) + b"".join(parts)
-    return body + struct.pack("<H", sum(body) & 0xFFFF)
+    return body + struct.pack("<H", (sum(body) + checksum) & 0xFFFF)
+
+
+def pd0(i: int, heading: int, pitch: int, roll: int, nmea: Sequence[bytes] = ()) -> bytes:
+    """An ensemble of each 0.1 s."""
+    return ensemble((10, -1500, 0, 0), 10 * i, attitude=(heading, pitch, roll), nmea=nmea)
 
 
 def nortek(

@@ -150,8 +150,28 @@ def only(samples, *kinds):
     return [sample for sample in samples if isinstance(sample, kinds)]
 
 
-def shifted(samples, nanoseconds: int):
-    return [sample._replace(stamp_ns=sample.stamp_ns + nanoseconds) for sample in samples]
+def altered(samples, kinds, **fields):
+    """The samples, those of these kinds with other values in these fields, or with what a function makes of each."""
+    return [
+        sample._replace(**{name: value(sample) if callable(value) else value for name, value in fields.items()})
+        if isinstance(sample, kinds)
+        else sample
+        for sample in samples
+    ]
+
+
+def shifted(samples, nanoseconds: int, kinds=(DvlSample, ReferenceSample, ImuSample)):
+    return altered(samples, kinds, stamp_ns=lambda sample: sample.stamp_ns + nanoseconds)
+
+
+def pushed(samples, kinds, push):
+    """The samples, to the velocities of these kinds added what `push` gives of a sample: (3,) m/s."""
+    return altered(samples, kinds, velocity=lambda sample: tuple(np.add(sample.velocity, push(sample)).tolist()))
+
+
+def without(samples, kind, is_lost):
+    """The samples but for those of a kind that are lost by their time since the start, s."""
+    return [each for each in samples if not (isinstance(each, kind) and is_lost((each.stamp_ns - START_NS) / SECOND))]
 
 
 def variant(run: MatchedRun, **changes) -> MatchedRun:

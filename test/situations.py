@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from log_fixtures import general_nmea, pd0, sentence
+from log_fixtures import ensemble, general_nmea, sentence
 from scipy.spatial.transform import Rotation
 from stacks import FIX, GNSS_STD, IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, true_mounting
 
@@ -30,8 +30,7 @@ DVL, REFERENCE = "/dvl/velocity", "/gnss/velocity"
 KNOTS_PER_MPS = 1.0 / 0.514444
 # The surface before and after a dive, s.
 SURFACE_S = 60.0
-# Instrument coordinates, tilts used (EX of an ensemble).
-EX_INSTRUMENT = 0b01111
+INSTRUMENT_AXES, TILTS_USED = 1, 0b111  # EX of an ensemble
 SHIP_MPS, BED_MPS = 0.03, (0.10, 0.066, 0.0)
 
 
@@ -47,24 +46,24 @@ def sound(told: Told, reference: bool = True, yaw: float = 0.0, said_yaw: float 
 def meaningless_covariances(told: Told, wrong: bool) -> None:
     """A driver that fills its covariance with random numbers up to 1 (m/s)²."""
     sound(told)
-    for _, topic, _, message in told.rows:
-        if wrong and topic == DVL:
+    for message in told.said(DVL):
+        if wrong:
             message.twist.covariance[[0, 7, 14]] = told.rng.random(3)
 
 
 def one_axis_negated(told: Told, wrong: bool) -> None:
     """A driver whose z has the wrong sign."""
     sound(told)
-    for _, topic, _, message in told.rows:
-        if wrong and topic == DVL:
+    for message in told.said(DVL):
+        if wrong:
             message.twist.twist.linear.z *= -1.0
 
 
 def attitude_inverted(told: Told, wrong: bool) -> None:
     """An IMU driver whose quaternions are from the world to the body."""
     sound(told)
-    for _, _, kind, message in told.rows:
-        if wrong and kind == IMU:
+    for message in told.said(IMU):
+        if wrong:
             message.orientation.w *= -1.0
 
 
@@ -85,9 +84,8 @@ def yaw_other_than_said(yaw_deg: float, said_deg: float = 0.0) -> Callable[[Path
 def stamps_a_minute_and_a_half_ahead(told: Told, wrong: bool) -> None:
     """A DVL whose stamps are too far from the others to be estimated, but arrived with them."""
     sound(told)
-    for _, topic, _, message in told.rows:
-        if topic == DVL:
-            message.header.stamp.sec += 90
+    for message in told.said(DVL):
+        message.header.stamp.sec += 90
 
 
 def beam_low(told: Told, by: float) -> None:
@@ -95,10 +93,9 @@ def beam_low(told: Told, by: float) -> None:
     around = np.radians([45.0, 135.0, 225.0, 315.0])
     beams = np.column_stack([0.5 * np.cos(around), 0.5 * np.sin(around), np.full(4, -math.sqrt(0.75))])
     solved = np.linalg.pinv(beams)
-    for _, topic, _, message in told.rows:
-        if topic == DVL:
-            v = message.twist.twist.linear
-            v.x, v.y, v.z = (solved @ (beams @ [v.x, v.y, v.z] * [1.0, 1.0 - by, 1.0, 1.0])).tolist()
+    for message in told.said(DVL):
+        v = message.twist.twist.linear
+        v.x, v.y, v.z = (solved @ (beams @ [v.x, v.y, v.z] * [1.0, 1.0 - by, 1.0, 1.0])).tolist()
 
 
 def one_beam_low(told: Told, wrong: bool) -> None:
@@ -116,8 +113,8 @@ def one_beam_low_at_5_degrees(told: Told, wrong: bool) -> None:
 def quaternion_components_mixed_up(told: Told, wrong: bool) -> None:
     """An IMU driver that writes w, y, z, w in place of x, y, z, w."""
     sound(told)
-    for _, _, kind, message in told.rows:
-        if wrong and kind == IMU:
+    for message in told.said(IMU):
+        if wrong:
             q = message.orientation
             q.x, q.y, q.z = q.w, q.y, q.z
 
@@ -146,7 +143,7 @@ def wrong_transform_without_reference(told: Told, wrong: bool) -> None:
 def earth_axes_without_reference(told: Told, wrong: bool) -> None:
     """A driver that turns the velocity into east, north, up."""
     sound(told, reference=False)
-    velocities = [message.twist.twist.linear for _, topic, _, message in told.rows if topic == DVL]
+    velocities = [message.twist.twist.linear for message in told.said(DVL)]
     for (i, _), v in zip(told.every(5.0), velocities, strict=True):
         if wrong:
             v.x, v.y, v.z = (told.motion.rotation_enu_from_body[i] @ [v.x, v.y, v.z]).tolist()
@@ -157,8 +154,8 @@ def axes_of_the_driver_without_reference(change: Callable[[Any], None], yaw: flo
 
     def tell(told: Told, wrong: bool) -> None:
         sound(told, reference=False, yaw=yaw, said_yaw=yaw)
-        for _, topic, _, message in told.rows:
-            if wrong and topic == DVL:
+        for message in told.said(DVL):
+            if wrong:
                 change(message.twist.twist.linear)
 
     return tell
@@ -175,9 +172,8 @@ def swap_x_and_y(v: Any) -> None:
 def stamps_an_hour_ahead(told: Told, wrong: bool) -> None:
     """A DVL whose stamps are by a clock in another time zone."""
     sound(told)
-    for _, topic, _, message in told.rows:
-        if topic == DVL:
-            message.header.stamp.sec += 3600
+    for message in told.said(DVL):
+        message.header.stamp.sec += 3600
 
 
 def antenna_on_a_mast(told: Told, wrong: bool) -> None:
@@ -223,19 +219,15 @@ def ensembles(path: Path, yaw_deg: float = 0.0, bed_mps: Array | None = None) ->
         heading = math.degrees(math.atan2(enu_from_body[0, 0], enu_from_body[1, 0])) % 360.0
         east, north, _ = enu_from_body @ m.velocity_body[i] + rng.normal(0.0, SHIP_MPS, 3)
         course, knots = math.degrees(math.atan2(east, north)) % 360.0, math.hypot(east, north) * KNOTS_PER_MPS
-        written += pd0(
-            i // 10,
-            round(100.0 * heading) % 36000,
-            round(100.0 * tilt),
-            round(100.0 * math.degrees(roll)),
-            [
+        written += ensemble(
+            [round(-1000.0 * each) for each in (-left, ahead, up)] + [3], i, INSTRUMENT_AXES, flags=TILTS_USED,
+            attitude=(round(100.0 * heading) % 36000, round(100.0 * tilt), round(100.0 * math.degrees(roll))),
+            alignment=round(-100.0 * yaw_deg),
+            nmea=[
                 general_nmea(105, sentence(f"GPVTG,{course:.2f},T,,M,{knots:.3f},N,,K"), 0.0),
                 general_nmea(107, sentence(f"GPHDT,{heading:.2f},T"), 0.0),
             ],
-            [round(-1000.0 * each) for each in (-left, ahead, up)] + [3],
-            EX_INSTRUMENT,
-            round(-100.0 * yaw_deg),
-        )
+        )  # fmt: skip
     return imported(path, bytes(written))
 
 

@@ -73,6 +73,10 @@ class Told:
     def say(self, stamp_ns: int, topic: str, kind: str, message: Any, late_ns: int = 3_000_000) -> None:
         self.rows.append((stamp_ns + late_ns, topic, kind, message))
 
+    def said(self, name: str) -> list[Any]:
+        """The messages of a topic, or of a type."""
+        return [message for _, topic, kind, message in self.rows if name in (topic, kind)]
+
     # ------------------------------------------------------------------ sensors
 
     def dvl_velocities(self, places: list[int], mounting_rpy: tuple[float, ...]) -> Array:
@@ -111,19 +115,21 @@ class Told:
         rate_hz: float = 5.0,
         covariance: bool = True,
         std: float = GNSS_STD,
+        antenna: tuple[float, ...] = (0.0, 0.0, 0.0),
+        claimed: float | None = None,
     ) -> None:
-        """The velocity of the body's origin, axes: enu, ned or body."""
+        """The velocity of a point of the body (m), axes: enu, ned or body. claimed: the std it says, if not its own."""
         m = self.motion
         each = self.every(rate_hz, 0.04)
         places = [i for i, _ in each]
-        velocities = m.velocity_body[places]
+        velocities = m.velocity_body[places] + cross(m.angular_velocity[places], np.array(antenna))
         if axes != "body":
             velocities = np.einsum("nij,nj->ni", m.rotation_enu_from_body[places], velocities)
         if axes == "ned":
             velocities = velocities @ ENU_FROM_NED
         velocities = velocities + self.rng.normal(0.0, std, velocities.shape)
         for (_, stamp), velocity in zip(each, velocities, strict=True):
-            sample = Sample(stamp, velocity, std**2 * np.eye(3) if covariance else None)
+            sample = Sample(stamp, velocity, (claimed or std) ** 2 * np.eye(3) if covariance else None)
             self.say(stamp, topic, kind, self.make.velocity(kind, sample, frame))
 
     def imu(
@@ -345,9 +351,8 @@ def course_and_speed(told: Told) -> None:
     """nmea_navsat_driver: course and speed as a TwistStamped, east and north, frame of the receiver."""
     told.dvl("/dvl/twist", TWIST, "dvl_link")
     told.reference("/vel", TWIST_STAMPED, "gps", "enu", rate_hz=1.0, covariance=False)
-    for _, _, kind, message in told.rows:
-        if kind == TWIST_STAMPED:
-            message.twist.linear.z = 0.0
+    for message in told.said(TWIST_STAMPED):
+        message.twist.linear.z = 0.0
     told.imu("/imu/data", "base_link")
     told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
 

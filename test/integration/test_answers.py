@@ -26,13 +26,8 @@ from validation.stacks import shared_folder
 from validation.surveys.physics import DVL_BIAS_STD, draw, write_survey
 
 
-def vehicle(told: Told, frame: str = "map", antenna=(0.0, 0.0, 0.0), std: float = 0.03) -> None:
-    m = motion()
-    for i, stamp in told.every(5.0, 0.04):
-        velocity = m.velocity_body[i] + np.cross(m.angular_velocity[i], antenna)
-        velocity = m.rotation_enu_from_body[i] @ velocity + told.rng.normal(0.0, std, 3)
-        sample = Sample(stamp, velocity, std**2 * np.eye(3))
-        told.say(stamp, "/gps/vel", TWIST, told.make.velocity(TWIST, sample, frame))
+def vehicle(told: Told, frame: str = "map", antenna=(0.0, 0.0, 0.0)) -> None:
+    told.reference("/gps/vel", TWIST, frame, "enu", std=0.03, antenna=antenna)
 
 
 @pytest.mark.spread(1)
@@ -101,17 +96,7 @@ def test_a_track_that_gets_worse_is_at_most_marginal_and_said(after, expected):
     none = np.zeros((0, 2))
     found = objections(
         Navigation(
-            900.0,
-            900.0,
-            100.0,
-            8,
-            Drift(9.1, 3.0),
-            Drift(after, 3.0),
-            6.0,
-            True,
-            none[:, 0],
-            none[:, 0],
-            *[none] * 5,
+            900.0, 900.0, 100.0, 8, Drift(9.1, 3.0), Drift(after, 3.0), 6.0, True, none[:, 0], none[:, 0], *[none] * 5
         )
     )
     assert [each.severity for each in found] == expected
@@ -140,12 +125,9 @@ def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(t
 @pytest.mark.parametrize("claimed", [None, pytest.param(0.015, marks=pytest.mark.slow)])
 def test_the_noise_of_a_reference_that_claims_none_or_far_too_little_is_measured(tmp_path, claimed):
     """By a claim of a third most samples were outliers (combinations 326, 372)."""
-    told, m, kind = Told(), motion(), TWIST_STAMPED if claimed is None else TWIST
+    told, kind = Told(), TWIST_STAMPED if claimed is None else TWIST
     told.dvl("/dvl", TWIST, "dvl_link")
-    for i, stamp in told.every(5.0, 0.04):
-        velocity = m.rotation_enu_from_body[i] @ m.velocity_body[i] + told.rng.normal(0.0, 0.05, 3)
-        sample = Sample(stamp, velocity, None if claimed is None else claimed**2 * np.eye(3))
-        told.say(stamp, "/gps/vel", kind, told.make.velocity(kind, sample, "map"))
+    told.reference("/gps/vel", kind, "map", "enu", covariance=claimed is not None, claimed=claimed)
     told.imu("/imu", "base_link")
     run = dc.replay(told.write(tmp_path / "bag"))
     assert run.discovery.parameters.use_message_covariance is (claimed is None)
@@ -160,14 +142,11 @@ def test_noise_that_is_claimed_far_too_large_or_small_is_measured_and_no_reason_
     tmp_path, dvl_claims, reference_claims
 ):
     """Two of them were rejected as if the DVL were in the reference, the third as every sample was an outlier."""
-    told, m, std = Told(), motion(), 0.3 if reference_claims < 0.05 else 0.05
+    told, std = Told(), 0.3 if reference_claims < 0.05 else 0.05
     told.dvl("/dvl", TWIST, "dvl_link")
-    for row in told.rows:
-        row[3].twist.covariance[[0, 7, 14]] = dvl_claims**2
-    for i, stamp in told.every(5.0, 0.04):
-        velocity = m.rotation_enu_from_body[i] @ m.velocity_body[i] + told.rng.normal(0.0, std, 3)
-        message = told.make.velocity(TWIST, Sample(stamp, velocity, reference_claims**2 * np.eye(3)), "map")
-        told.say(stamp, "/gps/vel", TWIST, message)
+    for message in told.said("/dvl"):
+        message.twist.covariance[[0, 7, 14]] = dvl_claims**2
+    told.reference("/gps/vel", TWIST, "map", "enu", std=std, claimed=reference_claims)
     told.imu("/imu", "base_link")
     told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
     run = dc.replay(told.write(tmp_path / "bag"), history=False)
@@ -184,9 +163,8 @@ def test_positions_that_claim_metres_and_show_centimetres_are_no_filter_of_the_d
     told = Told()
     told.dvl("/dvl", TWIST, "dvl_link")
     told.fixes("/gps/fix", "gps_link", 5.0, 0.012)
-    for row in told.rows:
-        if row[1] == "/gps/fix":
-            row[3].position_covariance = (claimed**2 * np.eye(3)).ravel()
+    for message in told.said("/gps/fix"):
+        message.position_covariance = (claimed**2 * np.eye(3)).ravel()
     told.imu("/imu", "base_link")
     run = dc.replay(told.write(tmp_path / "bag"))
     assert run.discovery.parameters.use_message_covariance == taken

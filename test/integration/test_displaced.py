@@ -67,10 +67,7 @@ def recorded(
 
 @pytest.mark.parametrize(
     ("lever_arm", "late_s", "waves_mps"),
-    [
-        ((1.0, 0.2, 0.0), 2.5, 0.15),
-        pytest.param((1.3, -0.3, 0.0), -2.2, 0.02, marks=pytest.mark.slow),
-    ],
+    [((1.0, 0.2, 0.0), 2.5, 0.15), pytest.param((1.3, -0.3, 0.0), -2.2, 0.02, marks=pytest.mark.slow)],
     ids=["ahead and late by half a wave", "ahead and early"],
 )
 def test_a_dvl_that_is_displaced_or_late_is_not_taken_for_one_that_is_turned(tmp_path, lever_arm, late_s, waves_mps):

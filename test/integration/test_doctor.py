@@ -309,9 +309,8 @@ def test_nothing_is_observable_without_a_sample_and_the_next_command_keeps_the_o
 def test_of_positions_with_variances_that_are_none_no_error_is_claimed(variance, tmp_path, capsys):
     told = Told()
     rtk_positions_only(told)
-    for _, topic, _, message in told.rows:
-        if topic == "/rtk/fix":
-            message.position_covariance = np.diag([variance] * 3).ravel()
+    for message in told.said("/rtk/fix"):
+        message.position_covariance = np.diag([variance] * 3).ravel()
     out, errors = succeed(capsys, "doctor", told.write(tmp_path / "bag"))
     assert "no covariance" in out and "nan" not in out + errors
 
@@ -323,8 +322,7 @@ CLAIMED_RUNS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["harbour_box", "straight_leg", "a figure eight, arm unknown", "a mounting at 45 degrees"],
+    "name", ["harbour_box", "straight_leg", "a figure eight, arm unknown", "a mounting at 45 degrees"]
 )
 @pytest.mark.spread(1)
 def test_the_standard_deviations_are_those_that_the_replay_claims(name, tmp_path):

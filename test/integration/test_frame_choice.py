@@ -158,10 +158,9 @@ def test_two_negated_axes_are_a_mounting_or_the_drivers(tmp_path):
     """Of a vehicle that heaves."""
     told = Told(motion=five_minutes())
     sound(told)
-    for _, topic, _, message in told.rows:
-        if topic == DVL:
-            v = message.twist.twist.linear
-            v.x, v.z = -v.x, -v.z
+    for message in told.said(DVL):
+        v = message.twist.twist.linear
+        v.x, v.z = -v.x, -v.z
     assert "negate x and z in the DVL's driver" in doctor(told.write(tmp_path / "bag")).reasons[0].sentence
 
 

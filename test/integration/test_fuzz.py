@@ -84,10 +84,7 @@ def test_whatever_a_parameter_is_set_to_it_is_taken_or_refused_with_its_name(nam
 
 
 @searched(30)
-@given(
-    st.sampled_from(["replay", "salvage", "parameters", "import", "evaluate"]),
-    st.lists(ARGUMENTS, max_size=5),
-)
+@given(st.sampled_from(["replay", "salvage", "parameters", "import", "evaluate"]), st.lists(ARGUMENTS, max_size=5))
 def test_whatever_is_typed_ends_with_success_or_one_line_and_exit_code_2(tmp_path_factory, command, arguments):
     # nothing that could start real work or write: the file that is read does not exist
     missing = str(tmp_path_factory.getbasetemp() / "missing")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_line import unfit
 from conftest import few
 from fleet_fixtures import write_dive
 from io_fixtures import rewrite, run
@@ -29,11 +30,6 @@ from dvl_calib_ros.fleet_catalogue.update import Catalogue, CataloguePart
 EVIL = "x\x1b[2J\x1b]0;y\x07\u202ey\x9b2J\r\nnote: forged[/red][bold]<b>"
 SEEN = "x\\x1b[2J\\x1b]0;y\\x07\\u202ey\\x9b2J\\r\\nnote: forged[/red][bold]<b>"
 FILE = EVIL.replace("/", "")
-
-
-def unfit(text: str) -> list[str]:
-    """What must not come to a terminal, each with what is around it."""
-    return [text[max(at - 60, 0) : at + 9] for at, c in enumerate(text) if not c.isprintable() and c not in "\n\t"]
 
 
 def said(capsys, *arguments, codes=(0, 1, 2, 3, 4)) -> str:

@@ -83,10 +83,7 @@ def test_what_follows_ros_args_stays_behind_the_profile(folder):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (
-            "save: /etc/passwd",
-            ".dvl-calib.yaml: no profile ('save'); it holds dvl-topic, gnss-topic, ",
-        ),
+        ("save: /etc/passwd", ".dvl-calib.yaml: no profile ('save'); it holds dvl-topic, gnss-topic, "),
         ("- a", "no profile (no names)"),
         ("dvl-topic: [a]", "dvl-topic is no text"),
         ("parameters: 3", "parameters is not a list of name: value"),

@@ -174,15 +174,11 @@ ANTENNA = (-0.3, 0.0, 0.4)
 )
 def test_what_is_written_is_the_dvl_in_base_link_or_nothing(tmp_path, capsys, frame, position):
     """The lever arm is from the antenna; where that is nobody knows, the transform of the DVL stands, or nothing."""
-    told, m = Told(), motion()
+    told = Told()
     told.dvl("/dvl", TWIST, "dvl_link")
-    antenna = np.array(ANTENNA if frame in ("gps_link", "map") else (0.0, 0.0, 0.0))
-    for i, stamp in told.every(5.0, 0.04):
-        velocity = m.velocity_body[i] + np.cross(m.angular_velocity[i], antenna) + told.rng.normal(0.0, 0.02, 3)
-        if frame != "base_link":
-            velocity = m.rotation_enu_from_body[i] @ velocity
-        sample = Sample(stamp, velocity, 4e-4 * np.eye(3))
-        told.say(stamp, "/gps/vel", TWIST, told.make.velocity(TWIST, sample, frame or "map"))
+    antenna = ANTENNA if frame in ("gps_link", "map") else (0.0, 0.0, 0.0)
+    axes = "body" if frame == "base_link" else "enu"
+    told.reference("/gps/vel", TWIST, frame or "map", axes, std=0.02, antenna=antenna)
     told.imu("/imu", "base_link")
     if frame:
         antennas = [told.transform("base_link", "gps_link", (0.0, 0.0, 0.0), ANTENNA)] if frame == "gps_link" else []
@@ -207,19 +203,16 @@ def turned_over(told: Told) -> None:
 
 def inverted(told: Told) -> None:
     told.imu("/imu", "base_link")
-    for row in told.rows:
-        if row[1] == "/imu":
-            q = row[3].orientation
-            q.x, q.y, q.z = -q.x, -q.y, -q.z
+    for message in told.said("/imu"):
+        message.orientation.w *= -1.0
 
 
 def w_first(told: Told) -> None:
     """Components as w, x, y, z: gravity turns with the heading, so its mean hardly leans."""
     told.imu("/imu", "base_link")
-    for row in told.rows:
-        if row[1] == "/imu":
-            q = row[3].orientation
-            q.x, q.y, q.z, q.w = q.w, q.x, q.y, q.z
+    for message in told.said("/imu"):
+        q = message.orientation
+        q.x, q.y, q.z, q.w = q.w, q.x, q.y, q.z
 
 
 def down_labelled_up(told: Told) -> None:
@@ -229,17 +222,15 @@ def down_labelled_up(told: Told) -> None:
 
 def in_g(told: Told) -> None:
     told.imu("/imu", "base_link")
-    for row in told.rows:
-        if row[1] == "/imu":
-            row[3].linear_acceleration.z /= 9.81
+    for message in told.said("/imu"):
+        message.linear_acceleration.z /= 9.81
 
 
 def pulls(told: Told) -> None:
     """Gravity, and not what holds against it, as some simulators have it."""
     told.imu("/imu", "base_link")
-    for row in told.rows:
-        if row[1] == "/imu":
-            row[3].linear_acceleration.z *= -1.0
+    for message in told.said("/imu"):
+        message.linear_acceleration.z *= -1.0
 
 
 @pytest.mark.spread(2)
@@ -256,14 +247,10 @@ def pulls(told: Told) -> None:
     ],
 )
 def test_gravity_turned_by_the_orientation_points_up_or_what_is_wrong_is_said(tmp_path, tell, code):
-    told, m = Told(), motion()
+    told = Told()
     told.dvl("/dvl", TWIST, "dvl_link")
     tell(told)
-    for i, stamp in told.every(5.0, 0.04):
-        velocity = m.rotation_enu_from_body[i] @ m.velocity_body[i] + told.rng.normal(0.0, 0.03, 3)
-        told.say(
-            stamp, "/gps/vel", TWIST, told.make.velocity(TWIST, Sample(stamp, velocity, 0.03**2 * np.eye(3)), "map")
-        )
+    told.reference("/gps/vel", TWIST, "map", "enu", std=0.03)
     bag = told.write(tmp_path / "bag")
     found = discover([bag], Parameters())
     if code.isupper():

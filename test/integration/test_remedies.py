@@ -78,10 +78,9 @@ def without_declination(degrees: float) -> Case:
     def write(path: Path) -> Path:
         told = Told()
         sound(told)
-        for _, _, kind, message in told.rows:
-            if kind == IMU:
-                q = message.orientation
-                q.x, q.y, q.z, q.w = (east * Rotation.from_quat([q.x, q.y, q.z, q.w])).as_quat().tolist()
+        for message in told.said(IMU):
+            q = message.orientation
+            q.x, q.y, q.z, q.w = (east * Rotation.from_quat([q.x, q.y, q.z, q.w])).as_quat().tolist()
         return told.write(path)
 
     return Case(write, {}, is_discovered=True)

@@ -7,6 +7,7 @@ import json
 import math
 import re
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -118,40 +119,38 @@ def test_several_recordings_have_one_water(bag):
 def told(ensemble: bytes, sensors: int) -> bytes:
     """An ensemble of `pd0` with EC 1500 m/s, ES 35, ET 12.1 °C, the last two from these sensors."""
     body = bytearray(ensemble[:-2])
-    fixed, variable = struct.unpack_from("<2H", body, 6)
+    fixed, _, variable = struct.unpack_from("<3H", body, 6)
     body[fixed + 30 : fixed + 32] = bytes([sensors, 0x3F])
     struct.pack_into("<H", body, variable + 14, 1500)
     struct.pack_into("<Hh", body, variable + 24, 35, 1210)
     return bytes(body) + struct.pack("<H", sum(body) & 0xFFFF)
 
 
-@pytest.mark.parametrize(("sensors", "temperature", "salinity"), [(0x7D, 12.1, np.nan), (0x7F, 12.1, 35.0)])
-def test_pd0_tells_what_it_measured_and_what_it_counted_with(sensors, temperature, salinity, tmp_path, capsys):
-    """A salinity that somebody typed in is none that the water has."""
-    path = tmp_path / "dive.pd0"
-    path.write_bytes(b"".join(told(pd0(i, 4500 + 10 * i, 200, -300), sensors) for i in range(40)))
-    said, _ = succeed(capsys, "import", path, "-o", tmp_path / "bag")
-    assert "4 readings of the water" in said
+def pd0_with(sensors: int) -> Callable[[int], bytes]:
+    return lambda i: told(pd0(i, 4500 + 10 * i, 200, -300), sensors)
+
+
+@pytest.mark.parametrize(
+    ("name", "packet", "readings", "temperature", "salinity"),
+    [
+        ("dive.pd0", pd0_with(0x7D), 4, 12.1, np.nan),
+        ("dive.pd0", pd0_with(0x7F), 4, 12.1, 35.0),
+        ("dive.pd0", pd0_with(0x3C), 4, np.nan, np.nan),
+        ("dive.ad2cp", lambda i: nortek(i, (1.5, 0.1, 0.0, 0.0)), 5, 8.0, np.nan),
+    ],
+    ids=["pd0", "pd0 with a conductivity", "pd0 without a thermometer", "nortek"],
+)
+def test_a_log_tells_what_it_measured_and_what_it_counted_with(
+    name, packet, readings, temperature, salinity, tmp_path, capsys
+):
+    """A salinity or temperature that somebody typed in is none that the water has."""
+    (tmp_path / name).write_bytes(b"".join(packet(i) for i in range(40)))
+    said, _ = succeed(capsys, "import", tmp_path / name, "-o", tmp_path / "bag")
+    assert f"{readings} readings of the water" in said
     water = open_recording([tmp_path / "bag"]).water(Topics())
     found = (water.temperature, water.salinity, water.used)
     assert found == pytest.approx((temperature, salinity, 1500.0), nan_ok=True)
-    assert water.source == "dvl/temperature"
-
-
-def test_a_temperature_that_was_typed_in_is_none_of_the_water(tmp_path, capsys):
-    path = tmp_path / "dive.pd0"
-    path.write_bytes(b"".join(told(pd0(i, 4500, 200, -300), 0x3C) for i in range(40)))
-    succeed(capsys, "import", path, "-o", tmp_path / "bag")
-    water = open_recording([tmp_path / "bag"]).water(Topics())
-    assert np.isnan(water.temperature) and water.used == 1500.0
-
-
-def test_nortek_tells_its_thermometer_and_speed_of_sound(tmp_path, capsys):
-    path = tmp_path / "dive.ad2cp"
-    path.write_bytes(b"".join(nortek(i, (1.5, 0.1, 0.0, 0.0)) for i in range(40)))
-    succeed(capsys, "import", path, "-o", tmp_path / "bag")
-    water = open_recording([tmp_path / "bag"]).water(Topics())
-    assert (water.temperature, water.used) == (8.0, 1500.0)
+    assert water.source == ("" if np.isnan(temperature) else "dvl/temperature")
 
 
 def reading(topic: str, value: float, kind: str = "temperature") -> OfWater:

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from io_fixtures import live, write_bag
+from runs import altered, pushed
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bag_replay.replay import replay
@@ -35,27 +36,17 @@ def run(mounting_rpy=(0.0, 0.0, 0.0), trajectory="figure8", frame=ENU, gnss_std=
     return tuple(heapq.merge(samples.imu, samples.gnss, samples.dvl, key=lambda sample: sample.stamp_ns))
 
 
-def references(samples, change):
-    return [change(sample) if isinstance(sample, ReferenceSample) else sample for sample in samples]
+def in_ned(samples):
+    """With a reference in ENU as a driver gives it that says ENU and means NED."""
+    return altered(samples, ReferenceSample, velocity=lambda s: tuple((ENU_FROM_NED.T @ s.velocity).tolist()))
 
 
-def in_ned(sample):
-    """A reference in ENU as a driver gives it that says ENU and means NED."""
-    return sample._replace(velocity=tuple((ENU_FROM_NED.T @ sample.velocity).tolist()))
+def attitude_in_ned(samples):
+    def turned(sample):
+        rotation = ENU_FROM_NED @ Rotation.from_quat(sample.orientation).as_matrix() @ FLU_FROM_FRD
+        return tuple(Rotation.from_matrix(rotation).as_quat().tolist())
 
-
-def attitude_in_ned(sample):
-    if not isinstance(sample, ImuSample):
-        return sample
-    rotation = ENU_FROM_NED @ Rotation.from_quat(sample.orientation).as_matrix() @ FLU_FROM_FRD
-    return sample._replace(orientation=tuple(Rotation.from_matrix(rotation).as_quat().tolist()))
-
-
-def imu_in_ned(sample):
-    if not isinstance(sample, ImuSample):
-        return sample
-    turned = FLU_FROM_FRD @ np.array(sample.angular_velocity)
-    return attitude_in_ned(sample)._replace(angular_velocity=tuple(turned.tolist()))
+    return altered(samples, ImuSample, orientation=turned)
 
 
 def of_the_dvl(samples):
@@ -76,22 +67,16 @@ def swinging(samples):
     """A reference that says 0.01 m/s and is off by 0.3 m/s, slowly: some effect that no model has."""
     first = samples[0].stamp_ns
 
-    def change(sample):
+    def off(sample):
         seconds = 1e-9 * (sample.stamp_ns - first)
-        off = (0.3 * math.sin(seconds / 9.0), 0.3 * math.cos(seconds / 14.0), 0.0)
-        covariance = np.eye(3) * 0.01**2
-        return sample._replace(velocity=tuple(np.add(sample.velocity, off).tolist()), covariance=covariance)
+        return 0.3 * math.sin(seconds / 9.0), 0.3 * math.cos(seconds / 14.0), 0.0
 
-    return references(samples, change)
+    return altered(pushed(samples, ReferenceSample, off), ReferenceSample, covariance=np.eye(3) * 0.01**2)
 
 
 def rates(samples, change):
-    return [
-        sample._replace(angular_velocity=tuple(change(np.array(sample.angular_velocity)).tolist()))
-        if isinstance(sample, ImuSample)
-        else sample
-        for sample in samples
-    ]
+    turned = lambda sample: tuple(change(np.array(sample.angular_velocity)).tolist())  # noqa: E731
+    return altered(samples, ImuSample, angular_velocity=turned)
 
 
 def with_a_compass(samples):
@@ -101,7 +86,7 @@ def with_a_compass(samples):
         yaw, pitch, roll = Rotation.from_quat(sample.orientation).as_euler("ZYX")
         return tuple(Rotation.from_euler("ZYX", [0.5 * math.pi - yaw, pitch, roll]).as_quat().tolist())
 
-    return [s._replace(orientation=change(s)) if isinstance(s, ImuSample) else s for s in samples]
+    return altered(samples, ImuSample, orientation=change)
 
 
 def in_the_earth(samples):
@@ -124,21 +109,18 @@ WRONG = {
     "ENU, body claimed": (run, {"gnss_frame": "body"}, "REFERENCE_LOOKS"),
     # of the two next ones roll would tell, which a level vehicle does not show: 180 degrees of it are chance
     "ENU, NED claimed": (run, {"gnss_frame": "ned"}, "REFERENCE_OR_IMU_NED"),
-    "NED, ENU claimed": (lambda: references(run(), in_ned), {}, "REFERENCE_OR_IMU_NED"),
-    "NED, body claimed": (
-        lambda: references(run(), in_ned), {"gnss_frame": "body"}, "REFERENCE_LOOKS",
-    ),
+    "NED, ENU claimed": (lambda: in_ned(run()), {}, "REFERENCE_OR_IMU_NED"),
+    "NED, body claimed": (lambda: in_ned(run()), {"gnss_frame": "body"}, "REFERENCE_LOOKS"),
     "body, ENU claimed": (lambda: run(frame=BODY), {"gnss_frame": "enu"}, "REFERENCE_LOOKS"),
-    "attitude in NED": (lambda: [attitude_in_ned(s) for s in run()], {}, "IMU_LOOKS_NED"),
-    "IMU in NED": (lambda: [imu_in_ned(s) for s in run()], {}, "IMU_LOOKS_NED"),
+    "attitude in NED": (lambda: attitude_in_ned(run()), {}, "IMU_LOOKS_NED"),
+    "IMU in NED": (lambda: rates(attitude_in_ned(run()), FLU_FROM_FRD.dot), {}, "IMU_LOOKS_NED"),
     "a reference with the DVL in it": (lambda: of_the_dvl(run()), {}, "HELD_OUT_IMPLAUSIBLE"),
     "rates negated": (lambda: rates(run(), np.negative), {}, "RATES_NEGATED"),
     "rates in degrees": (lambda: rates(run(), np.degrees), {}, "RATES_DEGREES"),
     "a compass heading as yaw": (lambda: with_a_compass(run()), {}, "HEADING_CLOCKWISE"),
     "a DVL in ENU": (lambda: in_the_earth(run()), {}, "DVL_TURNS_WITH_HEADING"),
     "a vehicle that stands": (
-        lambda: [s._replace(velocity=(0.0, 0.0, 0.0)) if not isinstance(s, ImuSample) else s for s in run()], {},
-        "NO_SAMPLE_USED",
+        lambda: altered(run(), (DvlSample, ReferenceSample), velocity=(0.0, 0.0, 0.0)), {}, "NO_SAMPLE_USED",
     ),
 }  # fmt: skip
 

@@ -71,11 +71,17 @@ def running(world):
     node.destroy_node()
 
 
+def publishers(world) -> list:
+    """Of what is said and of other things, heard by the node."""
+    made = [world.node.create_publisher(String, topic, FLOOD) for topic in ("said", "other")]
+    for publisher in made:
+        until(publisher.get_subscription_count, "the node")
+    return made
+
+
 def test_messages_topics_services_timers_and_parameters_all_have_their_turn_under_a_flood(world, running):
     node, _ = running
-    said, other = (world.node.create_publisher(String, topic, FLOOD) for topic in ("said", "other"))
-    for publisher in (said, other):
-        until(lambda publisher=publisher: publisher.get_subscription_count(), "the node")
+    said, other = publishers(world)
     for number in range(FLOOD):
         said.publish(String(data=str(number)))
     other.publish(String(data="else"))
@@ -91,9 +97,7 @@ def test_what_came_by_another_topic_before_the_messages_is_dealt_with_before_the
     node = Hearing(world.context)
     order: list[str] = []
     node.of_executor = node.said = order
-    said, other = (world.node.create_publisher(String, topic, FLOOD) for topic in ("said", "other"))
-    for publisher in (said, other):
-        until(lambda publisher=publisher: publisher.get_subscription_count(), "the node")
+    said, other = publishers(world)
     other.publish(String(data="first"))
     for number in range(100):
         said.publish(String(data=str(number)))

@@ -114,17 +114,24 @@ class Broadcaster:
 SENT: dict[str, list] = {}
 
 
-@pytest.mark.slow
-def test_with_publish_tf_the_transform_is_that_pose_and_another_of_the_same_frame_is_warned_of(world, monkeypatch):
+@pytest.fixture
+def sent(monkeypatch) -> dict[str, list]:
+    """What is broadcast, by the node."""
     stub = ModuleType("tf2_ros")
     stub.StaticTransformBroadcaster = Broadcaster
     monkeypatch.setitem(sys.modules, "tf2_ros", stub)
+    SENT.clear()
+    return SENT
+
+
+@pytest.mark.slow
+def test_with_publish_tf_the_transform_is_that_pose_and_another_of_the_same_frame_is_warned_of(world, sent):
     with node_here(world, publish_tf=True, dvl_frame="dvl_a50", dvl_position="told") as node:
         poses = world.received(PoseWithCovarianceStamped, f"{NODE}/mounting", LATCHED)
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         Publisher(world).send(*(twist(1000 + 0.2 * i, frame="dvl_a50") for i in range(30)))
-        until(lambda: received(node) == 30 and poses and SENT[NODE], "the mounting")
-        transform, pose = SENT[NODE][-1], poses[-1].pose.pose
+        until(lambda: received(node) == 30 and poses and sent[NODE], "the mounting")
+        transform, pose = sent[NODE][-1], poses[-1].pose.pose
         assert (transform.header.frame_id, transform.child_frame_id) == ("base_link", "dvl_a50")
         assert transform.transform.rotation == pose.orientation
         move = transform.transform.translation
@@ -140,11 +147,7 @@ def test_with_publish_tf_the_transform_is_that_pose_and_another_of_the_same_fram
         until(lambda: "TF_TWICE" in diagnostics[-1].status[0].message, "the warning")
 
 
-def test_no_transform_is_broadcast_of_a_dvl_whose_place_nobody_knows_and_that_is_said(world, monkeypatch):
-    stub = ModuleType("tf2_ros")
-    stub.StaticTransformBroadcaster = Broadcaster
-    monkeypatch.setitem(sys.modules, "tf2_ros", stub)
-    SENT.clear()
+def test_no_transform_is_broadcast_of_a_dvl_whose_place_nobody_knows_and_that_is_said(world, sent):
     with node_here(world, publish_tf=True, lever_arm=[0.3, 0.0, -0.1]) as node:
         poses = world.received(PoseWithCovarianceStamped, f"{NODE}/mounting", LATCHED)
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
@@ -152,14 +155,10 @@ def test_no_transform_is_broadcast_of_a_dvl_whose_place_nobody_knows_and_that_is
         until(lambda: received(node) == 30 and poses, "the mounting")
         assert np.isnan(poses[-1].pose.pose.position.x)
         until(lambda: diagnostics and "POSITION_UNKNOWN" in diagnostics[-1].status[0].message, "the finding")
-        assert not SENT[NODE]
+        assert not sent[NODE]
 
 
-def test_no_transform_is_broadcast_unless_asked_for(world, monkeypatch):
-    stub = ModuleType("tf2_ros")
-    stub.StaticTransformBroadcaster = Broadcaster
-    monkeypatch.setitem(sys.modules, "tf2_ros", stub)
-    SENT.clear()
+def test_no_transform_is_broadcast_unless_asked_for(world, sent):
     with node_here(world):
         pass
-    assert not SENT
+    assert not sent

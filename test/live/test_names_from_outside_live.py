@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from command_line import unfit
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
@@ -14,10 +15,6 @@ from std_srvs.srv import Trigger
 from test_node import Publisher, node_here, twist
 
 EVIL = "x\x1b[2J\x1b]0;y\x07\u202ey\x9b2J\r\nnote: forged"
-
-
-def unfit(text: str) -> list[str]:
-    return [text[max(at - 60, 0) : at + 9] for at, c in enumerate(text) if not c.isprintable() and c not in "\n\t"]
 
 
 def test_what_the_node_says_of_names_from_outside_is_fit_for_a_terminal(world, tmp_path, capfd):

@@ -156,6 +156,11 @@ def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_l
         (["-p", "result_file:=/no/such/folder/r.yaml"], "the folder /no/such/folder does not exist"),
         (["-p", "initial_calibration:=/no/such/file"], "/no/such/file: no such result file"),
         (["--params-file", "/no/such/file.yaml"], "/no/such/file.yaml"),
+        (["-p", "dvl_type:=marine_acoustic_msgs/Dvl"], "sudo apt install ros-$ROS_DISTRO-marine-acoustic-msgs"),
+        (["-p", "gnss_type:=dvl_msgs/DVL"], "gnss_type: 'dvl_msgs/DVL' is none of geometry_msgs/msg/Twist"),
+        # a reference that is the DVL itself agrees with every mounting that it is given
+        (["-r", "dvl/twist:=/a", "-r", "gnss/twist:=/a"], "dvl/twist and gnss/twist are both /a;"),
+        (["-r", "gnss/twist:=/dvl_calibration/calibrated_twist"], "gnss/twist and ~/calibrated_twist are both /dvl_ca"),
     ],
 )
 def test_a_bad_configuration_is_refused_at_the_start_in_one_line(capfd, arguments, said):
@@ -301,6 +306,7 @@ def test_models_are_switched_by_parameter_at_once_and_a_late_subscriber_gets_the
         ("target_drift", float("nan"), ""),
         ("result_file", "/no/such/folder/r.yaml", "a running node accepts only"),
         ("no_such_parameter", 1.0, ""),
+        ("model", "positions", "needs positions"),
     ],
 )
 def test_a_bad_parameter_is_refused_live_with_the_reason_and_nothing_changes(name, value, reason, world):

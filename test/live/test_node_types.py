@@ -17,8 +17,7 @@ from io_fixtures import run
 from live_fixtures import sent
 from nav_msgs.msg import Odometry
 from position_fixtures import write_positions
-from rclpy.parameter import Parameter
-from ros import refused_at_start, until
+from ros import until
 from test_node import as_arguments, assert_agree, diagnosed, node_here, play, received
 
 from dvl_calib_ros.bag_replay.replay import replay
@@ -39,26 +38,6 @@ from dvl_calib_ros.verdict.reasons import finding
 from validation.positions import Truth, driven
 
 WHEREABOUTS = ("refused", "unusable", "unpaired", "waiting", "gathered", "used", "gated")
-
-
-@pytest.mark.parametrize(
-    "arguments, said",
-    [
-        (["-p", "dvl_type:=marine_acoustic_msgs/Dvl"], "sudo apt install ros-$ROS_DISTRO-marine-acoustic-msgs"),
-        (["-p", "gnss_type:=dvl_msgs/DVL"], "gnss_type: 'dvl_msgs/DVL' is none of geometry_msgs/msg/Twist"),
-    ],
-)
-def test_a_type_that_cannot_be_is_refused_at_the_start_in_one_line(capfd, arguments, said):
-    errors = refused_at_start(capfd, *arguments)
-    assert len(errors.splitlines()) == 1 and said in errors
-
-
-def test_one_topic_for_two_sensors_is_refused_at_the_start_in_one_line(capfd):
-    """A reference that is the DVL itself agrees with every mounting that it is given."""
-    errors = refused_at_start(capfd, "-r", "dvl/twist:=/a50/velocity", "-r", "gnss/twist:=/a50/velocity")
-    assert len(errors.splitlines()) == 1 and "dvl/twist and gnss/twist are both /a50/velocity" in errors
-    errors = refused_at_start(capfd, "-r", "gnss/twist:=/dvl_calibration/calibrated_twist")
-    assert len(errors.splitlines()) == 1 and "gnss/twist and ~/calibrated_twist are both /dvl_calib" in errors
 
 
 def test_what_is_missing_is_named_as_it_was_remapped(world):
@@ -245,10 +224,3 @@ def test_topics_that_were_named_are_kept_and_none_is_looked_for_if_nobody_wants_
             assert (node._discovering is not None) == options.get("discover", True)
             named = {role for role, topic in node._named_topics(has_dvl=False).items() if topic is not None}
             assert named == ({"dvl"} if "cli_args" in options else set())
-
-
-def test_the_model_of_positions_is_refused_while_the_reference_is_velocities(world):
-    with node_here(world) as node:
-        (answer,) = node.set_parameters([Parameter("model", value=POSITIONS.name)])
-        assert not answer.successful and "needs positions" in answer.reason
-        assert node._calibrator.selected != POSITIONS.name

@@ -398,18 +398,11 @@ def terminal(world, *arguments: str):
 
 
 def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, tmp_path):
-    from geometry_msgs.msg import TwistWithCovarianceStamped
-    from ros import until
+    from test_node import Publisher, twist
 
     saved = tmp_path / "result.yaml"
     with terminal(world, "run", "--watch", "-p", f"result_file:={saved}", "-p", "gnss_frame:=enu") as screen:
-        publisher = world.node.create_publisher(TwistWithCovarianceStamped, "dvl/twist", 100)
-        until(lambda: publisher.get_subscription_count() == 1, "the node's subscription")
-        for i in range(20):
-            message = TwistWithCovarianceStamped()
-            message.header.stamp.sec, message.header.frame_id = 1000 + i, "dvl_link"
-            message.twist.twist.linear.x = 1.5
-            publisher.publish(message)
+        Publisher(world).send(*(twist(1000 + i) for i in range(20)))
         for text in ("mounting now", "drift", "next: ", "model auto; parameters", "s save"):
             screen.until(text)
         seen = pyte.Screen(80, 24)
@@ -429,19 +422,14 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
 
 @pytest.mark.slow
 def test_q_does_not_replace_a_good_result_by_a_few_samples_without_asking(world, tmp_path):
-    from geometry_msgs.msg import TwistWithCovarianceStamped
-    from ros import until
+    from test_node import Publisher, twist
 
     saved = tmp_path / "result.yaml"
     calibrated = result_document(calibrate(make_samples(MatchedRun(dvl_std=0.01, gnss_std=0.01))).result())
     save_result(saved, calibrated | {"verification": {"verdict": "accept", "reasons": ["so"]}})
     good = saved.read_bytes()
     with terminal(world, "run", "--watch", "-p", f"result_file:={saved}", "-p", "model:=M7") as screen:
-        publisher = world.node.create_publisher(TwistWithCovarianceStamped, "dvl/twist", 100)
-        until(lambda: publisher.get_subscription_count() == 1, "the node's subscription")
-        message = TwistWithCovarianceStamped()
-        message.header.stamp.sec, message.header.frame_id, message.twist.twist.linear.x = 1000, "dvl_link", 1.5
-        publisher.publish(message)
+        Publisher(world).send(twist(1000))
         screen.until("mounting")
         screen.until("DVL ")
         screen.key(b"q")

@@ -140,11 +140,17 @@ def test_what_is_measured_is_stored_with_where_it_is_from_and_written_into_the_p
     assert main(["figures", "--check"]) == 0
 
 
-def test_a_figure_that_is_off_is_named_by_page_block_and_both_values(place, monkeypatch, capsys):
+@pytest.fixture
+def rendered(place, monkeypatch, capsys) -> Path:
+    """The project with its figures measured."""
     measures(monkeypatch, lambda _: {"fast": 2.345, "slow": 0.5})
     main(["figures"])
-    measures(monkeypatch, lambda _: {"fast": 2.4, "slow": 0.8})
     capsys.readouterr()
+    return place
+
+
+def test_a_figure_that_is_off_is_named_by_page_block_and_both_values(rendered, monkeypatch, capsys):
+    measures(monkeypatch, lambda _: {"fast": 2.4, "slow": 0.8})
     assert main(["figures", "--check"]) == 1
     said = capsys.readouterr()
     assert said.err.splitlines() == [
@@ -153,26 +159,20 @@ def test_a_figure_that_is_off_is_named_by_page_block_and_both_values(place, monk
     assert "3 figures checked, 0 skipped" in said.out
 
 
-def test_a_page_that_was_edited_by_hand_is_named(place, monkeypatch, capsys):
-    measures(monkeypatch, lambda _: {"fast": 2.345, "slow": 0.5})
-    main(["figures"])
-    page = place / "README.md"
+def test_a_page_that_was_edited_by_hand_is_named(rendered, capsys):
+    page = rendered / "README.md"
     page.write_text(page.read_text().replace(">2.3<", ">9.9<"))
-    capsys.readouterr()
     assert main(["figures", "--check"]) == 1
     assert "README.md, block {speeds[fast]:.1f}: not what --render writes" in capsys.readouterr().err
     assert main(["figures", "--render"]) == 0 and ">2.3<" in page.read_text()
 
 
-def test_without_its_data_a_measurement_is_skipped_with_the_reason_and_its_figures_counted(place, monkeypatch, capsys):
-    measures(monkeypatch, lambda _: {"fast": 2.345, "slow": 0.5})
-    main(["figures"])
-
+@pytest.mark.usefixtures("rendered")
+def test_without_its_data_a_measurement_is_skipped_with_the_reason_and_its_figures_counted(monkeypatch, capsys):
     def missing(_):
         raise registry.MissingDataError("no data in x; name it in Y")
 
     measures(monkeypatch, missing)
-    capsys.readouterr()
     assert main(["figures", "--check"]) == 0
     out = capsys.readouterr().out
     assert "skipped: speeds: no data in x; name it in Y; 3 figures not checked" in out

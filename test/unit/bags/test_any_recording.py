@@ -299,9 +299,7 @@ def big_endian(topic: str, data: bytes) -> bytes:
 
 @pytest.mark.spread(1)
 @pytest.mark.parametrize(
-    "change",
-    [big_endian, lambda _, data: data + bytes(4)],
-    ids=["big-endian", "4 bytes of padding"],
+    "change", [big_endian, lambda _, data: data + bytes(4)], ids=["big-endian", "4 bytes of padding"]
 )
 def test_messages_in_big_endian_or_with_padding_are_read_as_they_are(tmp_path, change):
     samples = raw(write_bag(tmp_path / "bag", run(20.0)))
@@ -405,11 +403,7 @@ def test_what_a_damaged_definition_makes_of_messages_is_told_of_each():
 
 @pytest.mark.parametrize(
     ("log_times", "options"),
-    [
-        ((5, 2**64 - 1, 2**63, 7), {}),
-        ((5, 2**64 - 1, 2**63, 7), {"use_chunking": False}),
-        ((2**63 - 1,) * 4, {}),
-    ],
+    [((5, 2**64 - 1, 2**63, 7), {}), ((5, 2**64 - 1, 2**63, 7), {"use_chunking": False}), ((2**63 - 1,) * 4, {})],
 )
 def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path, log_times, options):
     messages = [("dvl/twist", log_ns, data) for log_ns, (_, _, data) in zip(log_times, raw_twists(), strict=True)]

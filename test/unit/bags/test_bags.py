@@ -57,15 +57,11 @@ def test_every_storage_and_compression_gives_the_same_estimates(tmp_path, expect
 
 
 @pytest.mark.parametrize(("storage", "compression"), KINDS)
-def test_a_storage_file_alone_gives_the_same_messages_as_its_folder(tmp_path, plain, storage, compression):
+def test_a_file_alone_gives_the_same_messages_and_so_does_a_folder_without_metadata(
+    tmp_path, plain, storage, compression
+):
     bag = write_bag(tmp_path / "bag", run(), storage, compression)
-    messages, notes = raw_and_notes(storage_file(bag))
-    assert messages == raw(plain) and not notes
-
-
-@pytest.mark.parametrize(("storage", "compression"), KINDS)
-def test_a_folder_without_metadata_gives_the_same_messages_and_says_so(tmp_path, plain, storage, compression):
-    bag = write_bag(tmp_path / "bag", run(), storage, compression)
+    assert raw_and_notes(storage_file(bag)) == (raw(plain), [])
     (bag / "metadata.yaml").unlink()
     messages, notes = raw_and_notes(bag)
     assert messages == raw(plain)
@@ -122,29 +118,25 @@ def test_mcap_files_of_other_writers_give_the_same_messages(tmp_path, plain, com
     assert messages == raw(plain) and not notes
 
 
-@pytest.mark.spread(2)
-@pytest.mark.parametrize(("at_once", "in_memory"), [(0, batches.IN_MEMORY), (0, 20_000), (1 << 30, 20_000)])
-def test_chunks_of_one_topic_each_are_merged_in_memory_or_on_disk(tmp_path, plain, monkeypatch, at_once, in_memory):
-    monkeypatch.setattr(sources, "MERGED_AT_ONCE", at_once)
-    monkeypatch.setattr(batches, "IN_MEMORY", in_memory)
-    by_topic = sorted(raw(plain), key=lambda message: message[0])
-    (tmp_path / "by_topic.mcap").write_bytes(mcap_bytes(by_topic, chunk_size=30_000, compression=CompressionType.LZ4))
-    found, notes = raw_and_notes(tmp_path / "by_topic.mcap")
-    assert [log_ns for _, log_ns, _ in found] == sorted(log_ns for _, log_ns, _ in by_topic)
-    assert sorted(found) == sorted(by_topic) and not notes
-    assert estimates(tmp_path / "by_topic.mcap") == estimates(plain)
+CHUNKS = {"chunk_size": 30_000, "compression": CompressionType.LZ4}
 
 
-@pytest.mark.parametrize("in_memory", [batches.IN_MEMORY, 20_000])
-@pytest.mark.parametrize("is_cut", [False, True])
-@pytest.mark.spread(2)
-def test_log_times_out_of_order_in_a_file_without_index_are_put_in_order(
-    tmp_path, plain, monkeypatch, in_memory, is_cut
+@pytest.mark.spread(4)
+@pytest.mark.parametrize(
+    ("options", "at_once", "in_memory", "is_cut"),
+    [
+        (CHUNKS, 0, batches.IN_MEMORY, False), (CHUNKS, 0, 20_000, False), (CHUNKS, 1 << 30, 20_000, False),
+        *(({"use_chunking": False}, None, kept, cut) for cut in (False, True) for kept in (batches.IN_MEMORY, 20_000)),
+    ],
+)  # fmt: skip
+def test_log_times_of_one_topic_after_the_other_are_put_in_order_in_memory_or_on_disk(
+    tmp_path, plain, monkeypatch, options, at_once, in_memory, is_cut
 ):
-    """One topic after the other, as of a recorder that caches by topic; in memory, or for the greater part on disk."""
+    """As of a recorder that caches by topic, in chunks with an index or without either."""
+    monkeypatch.setattr(sources, "MERGED_AT_ONCE", sources.MERGED_AT_ONCE if at_once is None else at_once)
     monkeypatch.setattr(batches, "IN_MEMORY", in_memory)
     by_topic = sorted(raw(plain), key=lambda message: message[0])
-    content = mcap_bytes(by_topic, use_chunking=False)
+    content = mcap_bytes(by_topic, **options)
     (tmp_path / "by_topic.mcap").write_bytes(content[:-37] if is_cut else content)
     found, notes = raw_and_notes(tmp_path / "by_topic.mcap")
     assert [log_ns for _, log_ns, _ in found] == sorted(log_ns for _, log_ns, _ in by_topic)

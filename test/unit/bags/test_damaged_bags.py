@@ -419,10 +419,7 @@ def test_what_cannot_be_replayed_is_named_in_one_line_with_exit_code_2(tmp_path,
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (
-            ["--dvl-topic", "imu/data"],
-            "topic imu/data holds sensor_msgs/msg/Imu, expected geo",
-        ),
+        (["--dvl-topic", "imu/data"], "topic imu/data holds sensor_msgs/msg/Imu, expected geo"),
         (["--gnss-topic", "imu/data"], "set --gnss-topic"),
         (["--gnss-topic", "imu/data", "-p", "prior_source:=reference"], "set --gnss-topic"),
         (["--imu-topic", "gnss/twist"], "expected sensor_msgs/msg/Imu; set --imu-topic"),
@@ -437,17 +434,6 @@ def test_a_topic_of_another_type_is_named_with_the_option_to_set(tmp_path, capsy
     assert main(["replay", str(bag), *options]) == 2
     output = capsys.readouterr()
     assert output.err.count("\n") == 1 and expected in output.err
-
-
-def test_a_file_without_permission_is_named_in_one_line(tmp_path, capsys, monkeypatch):
-    bag = write_bag(tmp_path / "bag", run(6.0))
-
-    def denied(path, *_):
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(os, "open", denied)
-    assert main(["replay", str(bag)]) == 2
-    assert "Permission denied" in capsys.readouterr().err
 
 
 def test_a_database_whose_journal_is_lost_gives_what_the_database_holds(tmp_path):

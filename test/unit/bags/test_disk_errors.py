@@ -217,16 +217,23 @@ def test_what_is_told_of_unreadable_bytes_is_exact(tmp_path):
         assert unreadable(file) == 2 * SECTOR
 
 
-def test_other_errors_of_a_disk_than_unreadable_places_are_told_in_one_line(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("calls", "error"),
+    [(("pread", "preadv"), (errno.ESTALE, "Stale file handle")), (("open",), (errno.EACCES, "Permission denied"))],
+)
+def test_other_errors_of_a_disk_than_unreadable_places_are_told_in_one_line(
+    tmp_path, capsys, monkeypatch, calls, error
+):
     bag = write_bag(tmp_path / "bag", run(6.0))
 
-    def gone(*_):
-        raise OSError(errno.ESTALE, "Stale file handle")
+    def fails(*_):
+        raise OSError(*error)
 
-    monkeypatch.setattr(os, "pread", gone)
-    monkeypatch.setattr(os, "preadv", gone)
+    for call in calls:
+        monkeypatch.setattr(os, call, fails)
     assert main(["replay", str(bag)]) == 2
-    assert "Stale file handle" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert error[1] in said and said.count("\n") == 1
 
 
 def test_salvage_from_a_bad_disk_writes_what_can_be_read(tmp_path, messages, capsys):

@@ -17,14 +17,7 @@ from dvl_calib_ros.bags.channels import Definition, typestore
 from dvl_calib_ros.bags.columns import MessageColumns, NoLayoutError, layout_of
 
 NUMBERS = (
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
     "float32",
     "float64",
     "byte",

@@ -1,17 +1,36 @@
-"""An IMU's attitude and angular velocity are held against each other, with no other sensor."""
+"""The IMU: conventions that contradict each other, a compass that deviates, and how it is mounted."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.checks.heading_deviation import heading_deviation, heading_warning
 from dvl_calib_ros.calibration.checks.imu_rate_consistency import CONVENTIONS, AttitudeRates
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import (
     ENU_FROM_NED,
+    attitude_enu_flu_from_ned_frd,
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_rpy,
 )
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.samples import (
+    DvlSample,
+    ImuSample,
+    ReferenceSample,
+    Stream,
+    VelocityFrame,
+    sample_block,
+)
+from dvl_calib_ros.calibration.streams.imu_frame import ImuAlignment
 
 RATE_HZ, TILT = 20.0, np.radians(2.0)
 
@@ -134,3 +153,148 @@ def test_an_attitude_without_roll_and_pitch_is_a_heading_alone():
             orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
         checked.add(times, orientation, rates)
         assert checked.is_level is is_level
+
+
+# ---------------------------------------------------------------------- a compass that deviates
+
+
+START_NS, STEP_S, LEG_S = 1_600_000_000_000_000_000, 0.5, 40.0
+YAW = math.radians(1.0)  # of the DVL in the vehicle
+
+
+def recorded(seed, off, offset=(0.0, 0.0), legs=16, every=math.pi / 4.0, **parameters):
+    """Legs of 40 s at 1 m/s, each turned by `every` from the one before; off: (yaw, s) -> by what the heading is off.
+
+    offset: m/s, of the reference east and north. Returns the calibrator, times (N,) and true yaws (N,).
+    """
+    rng = np.random.default_rng(seed)
+    exact_dvl = Parameters(gnss_aided_std=0.03, dvl_bias_std=0.0, **parameters)
+    calibrator = Calibrator(exact_dvl, block_size=64, models=("full",))
+    time = np.arange(0.0, LEG_S * legs, STEP_S)
+    yaw = np.floor(time / LEG_S) * every + 0.2
+    for at, heading in zip(time.tolist(), yaw.tolist(), strict=True):
+        stamp = START_NS + round(at * 1e9)
+        turned = rotation_from_rpy([0.0, 0.0, heading + off(heading, at)])
+        velocity = rotation_from_rpy([0.0, 0.0, heading])[:, 0] + (*offset, 0.0) + rng.normal(0.0, 0.03, 3)
+        dvl = rotation_from_rpy([0.0, 0.0, YAW])[:, 0] + rng.normal(0.0, 0.005, 3)
+        calibrator.feed_imu(ImuSample(stamp, quaternion_from_rotation(turned), (0.0, 0.0, 0.0)))
+        calibrator.feed_reference(ReferenceSample(stamp, tuple(velocity.tolist()), None, VelocityFrame.ENU))
+        calibrator.feed_dvl(DvlSample(stamp, tuple(dvl.tolist())))
+    calibrator.finish()
+    return calibrator, time, yaw
+
+
+def deviation(*args, **more):
+    calibrator, _, yaw = recorded(*args, **more)
+    return heading_deviation(yaw, calibrator.heading_deviation)
+
+
+@pytest.mark.spread(1)
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.012, -0.009)])
+def test_a_constant_error_of_the_heading_or_of_the_reference_is_no_deviation(offset):
+    assert deviation(0, lambda *_: 0.02, offset) is None
+
+
+@pytest.mark.spread(1)
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
+    size = math.radians(2.0)
+    found = deviation(1, lambda yaw, _: size * math.sin(cycles * yaw))
+    assert found.rms == pytest.approx(size / math.sqrt(2.0), rel=0.25)
+    if cycles == 1:  # most at the heading next to yaw 90 degrees, which is north
+        assert min(found.most_at, 2.0 * math.pi - found.most_at) < 0.25
+    said = heading_warning(found)
+    assert said.code == "HEADING_DEVIATION" and "with the heading" in said.says and "compass first" not in said.remedy
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("every", "size"),
+    [(math.pi / 4.0, 2.0), (math.pi, 2.0), (math.pi / 4.0, 0.0)],
+    ids=["around", "to and fro", "none"],
+)
+def test_yaw_is_within_its_sigma(every, size):
+    off = []
+    for seed in range(4):
+        deviates = lambda yaw, _, at=seed: math.radians(size) * math.sin(yaw + 1.6 * at)  # noqa: E731
+        calibrator, *_ = recorded(seed, deviates, legs=16, every=every)
+        estimate = calibrator.estimate("full")
+        off.append((estimate.state[2] - YAW) / estimate.recording_std[2])
+        assert estimate.recording_std[2] < math.radians(0.35 + 0.5 * size)
+    assert np.abs(off).max() < 3.0, off
+
+
+def test_on_one_heading_sigma_of_yaw_holds_what_the_heading_may_be_off_by():
+    calibrator, *_ = recorded(0, lambda *_: math.radians(0.8), every=0.0, reference_offset_std=0.001)
+    estimate = calibrator.estimate("full")
+    assert math.radians(0.45) < estimate.recording_std[2] < math.radians(0.8)
+    assert abs(estimate.state[2] - YAW) < 2.0 * estimate.recording_std[2]
+
+
+def test_few_headings_or_nothing_at_all_say_nothing():
+    assert deviation(3, lambda yaw, _: math.sin(yaw) * 0.05, legs=1) is None
+    assert heading_deviation(np.zeros(0), GaussianState(np.zeros(4), np.eye(4))) is None
+
+
+# ---------------------------------------------------------------------- how it is mounted
+
+
+ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
+
+
+def as_matrix(quaternion) -> np.ndarray:
+    return Rotation.from_quat(quaternion).as_matrix()
+
+
+@pytest.mark.parametrize("frame", ["enu", "ned"])
+@given(mounting=ANGLES, attitude=ANGLES, rate=ANGLES)
+def test_an_imu_that_is_mounted_turned_gives_the_bodys_attitude_and_rates(frame, mounting, attitude, rate):
+    enu_from_body = Rotation.from_euler("xyz", attitude).as_matrix()
+    body_from_imu = Rotation.from_euler("xyz", mounting).as_matrix()
+    world_from_enu = ENU_FROM_NED.T if frame == "ned" else np.eye(3)
+    measured = ImuSample(
+        7,
+        quaternion_from_rotation(world_from_enu @ enu_from_body @ body_from_imu),
+        tuple((body_from_imu.T @ np.array(rate)).tolist()),
+    )
+    turned = ImuAlignment(Parameters(imu_rpy=mounting, imu_frame=frame)).sample(measured)
+    assert turned.stamp_ns == 7
+    np.testing.assert_allclose(as_matrix(turned.orientation), enu_from_body, atol=1e-12)
+    np.testing.assert_allclose(turned.angular_velocity, rate, atol=1e-12)
+
+
+def test_a_heading_offset_turns_the_attitude_about_the_vertical_and_leaves_the_rates():
+    attitude, rate = Rotation.from_euler("ZYX", [0.7, -0.2, 0.1]), (0.1, 0.2, 0.3)
+    measured = ImuSample(0, tuple(attitude.as_quat().tolist()), rate)
+    turned = ImuAlignment(Parameters(heading_offset=0.4)).sample(measured)
+    wanted = Rotation.from_euler("ZYX", [1.1, -0.2, 0.1])
+    np.testing.assert_allclose(as_matrix(turned.orientation), wanted.as_matrix(), atol=1e-12)
+    assert turned.angular_velocity == pytest.approx(rate)
+
+
+def test_a_marine_imu_forward_right_down_in_north_east_down_is_imu_frame_ned_and_imu_rpy_pi():
+    rpy_ned = (0.1, -0.2, 1.3)
+    measured = ImuSample(0, quaternion_from_rotation(Rotation.from_euler("xyz", rpy_ned).as_matrix()), None)
+    turned = ImuAlignment(Parameters(imu_rpy=(math.pi, 0.0, 0.0), imu_frame="ned")).sample(measured)
+    np.testing.assert_allclose(as_matrix(turned.orientation), attitude_enu_flu_from_ned_frd(rpy_ned), atol=1e-12)
+    assert turned.angular_velocity is None
+
+
+def test_columns_are_turned_as_live_samples_are_and_what_is_not_given_stays_so():
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(6, 7))
+    values[:, :4] /= np.linalg.norm(values[:, :4], axis=1)[:, None]
+    values[2, :4] = np.nan
+    values[4, 4:] = np.nan
+    alignment = ImuAlignment(Parameters(imu_rpy=(0.3, -0.1, 2.0), imu_frame="ned"))
+    block = sample_block(Stream.IMU, np.arange(6), values)
+    one_by_one = [alignment.sample(sample) for sample in block.samples()]
+    assert list(alignment.block(block).samples()) == one_by_one
+    assert one_by_one[2].orientation is None and one_by_one[4].angular_velocity is None
+
+
+def test_without_its_parameters_samples_pass_as_the_same_objects():
+    alignment = ImuAlignment(Parameters())
+    sample = ImuSample(0, (0.0, 0.0, 0.0, 1.0), None)
+    block = sample_block(Stream.IMU, np.arange(1), np.zeros((1, 7)))
+    assert alignment.sample(sample) is sample and alignment.block(block) is block

@@ -134,8 +134,7 @@ def mean_of(noise):
 
 
 @pytest.mark.parametrize(
-    ("lasts", "number", "least", "most"),
-    [(0.0, 640, 0.8, 1.1), (60.0, 640, 0.7, 1.2), (10.0, 250, 0.8, 1.3)],
+    ("lasts", "number", "least", "most"), [(0.0, 640, 0.8, 1.1), (60.0, 640, 0.7, 1.2), (10.0, 250, 0.8, 1.3)]
 )
 def test_noise_that_lasts_longer_than_the_longest_blocks_is_in_sigma(lasts, number, least, most):
     """Of 640 samples blocks of 80 are the longest that there are enough of, of 250 those of 30."""

@@ -270,10 +270,7 @@ def test_what_one_of_two_has_not_shown_is_not_compared():
     shown = np.array([False, True, True, False, False, False, False, False])
     other = extrinsics(1, (0.0, 0.0, 0.7), shown=shown, model="M7", covariance=np.diag(np.where(shown, STD**2, 0.0)))
     found = compare([extrinsics(0), other])
-    assert [name for name, known in zip(COMPONENTS, found.pairs[0].compared, strict=True) if known] == [
-        "pitch",
-        "yaw",
-    ]
+    assert [name for name, known in zip(COMPONENTS, found.pairs[0].compared, strict=True) if known] == ["pitch", "yaw"]
     assert not found.same_mounting and np.isnan(found.pairs[0].std[0])
     assert [each.numbers["models"] for each in remarks(found) if each.code == "MODELS_DIFFER"] == ["full, M7"]
 

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 from runs import START_NS, calibrate
 
-from dvl_calib_ros.calibration.filters.cross_validation import HeldOutError
-from dvl_calib_ros.calibration.filters.observability import Convergence
-from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import (
     ENU_FROM_NED,
@@ -18,9 +15,7 @@ from dvl_calib_ros.calibration.numerics.frames import (
     quaternion_from_rotation,
     rotation_from_rpy,
 )
-from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.results.held_out_verification import verify
 from dvl_calib_ros.verdict.kinds import Severity
 
 PARAMETERS = Parameters(gnss_aided_std=0.03)
@@ -126,39 +121,6 @@ def test_a_dvl_that_is_late_by_half_a_wave_is_not_taken_for_one_that_points_down
     flipped = straight_in_waves(2.5, FLU_FROM_FRD)
     assert flipped.verdict is Severity.REJECT
     assert "DVL_AXES_TURNED" in {each.code for each in causes(flipped)}
-
-
-def judged(**changes):
-    state = GaussianState(np.zeros(4), np.eye(4) * 1e-6)
-    arguments = {"held_out": HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), "used_and_gated": (1000, 10)} | changes
-    return verify(MODELS["M3"], state, Convergence.FINE, parameters=Parameters(), **arguments)
-
-
-@pytest.mark.parametrize(
-    ("changes", "word", "code"),
-    [
-        ({}, Severity.ACCEPT, "HELD_OUT"),
-        ({"used_and_gated": (0, 0)}, Severity.REJECT, "NO_SAMPLE_USED"),
-        ({"used_and_gated": (400, 600)}, Severity.REJECT, "MOST_SAMPLES_GATED"),
-        ({"held_out": HeldOutError(1000, 0.30, 0.20, 0.05, 0.002)}, Severity.REJECT, "HELD_OUT_SEVERAL_TIMES"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.005, 0.05, 0.002)}, Severity.REJECT, "HELD_OUT_IMPLAUSIBLE"),
-    ],
-    ids=["good", "nothing used", "most gated", "much worse than predicted", "reference with the DVL in it"],
-)
-def test_a_verdict_protects(changes, word, code):
-    found = judged(**changes)
-    assert found.verdict is word
-    assert found.reasons[0].code == code
-
-
-def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
-    state = GaussianState(np.array([0.0, 0.05, 0.0, 0.0]), np.eye(4) * 1e-6)
-    found = verify(
-        MODELS["M3"], state, Convergence.FINE, HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), Parameters(), (1000, 0)
-    )
-    assert found.verdict is Severity.ACCEPT
-    assert found.mounting is not None and found.mounting.code == "MOUNTING_FAR"
-    assert found.mounting.numbers["degrees"] == pytest.approx(2.9, abs=0.05)
 
 
 @pytest.mark.parametrize("seed", [0, 3])

@@ -13,15 +13,19 @@ from dvl_calib_ros.calibration.numerics.frames import skew
 from validation.positions import NOISES, Driven, Noise, Truth, drawn, driven, errors_of, fitted
 
 
+def assert_found(fit, truth: Truth, yaw_deg: float) -> None:
+    """Yaw and scale within three σ, of which that of yaw is at most so much."""
+    error, std = errors_of(fit, truth)
+    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < yaw_deg
+
+
 @pytest.mark.parametrize("kind", NOISES)
 def test_half_an_hour_of_positions_with_2_m_of_noise_tells_yaw_and_scale(kind):
     rng = np.random.default_rng(5)
     truth = drawn(rng)
     fit = fitted(driven(rng, 1800.0, truth=truth, noise=NOISES[kind]))
-    error, std = errors_of(fit, truth)
-    assert (np.abs(error) < 3.0 * std).all()
-    assert std[1] < 0.005
-    assert math.degrees(std[0]) < (0.3 if kind in ("white", "outliers") else 0.45)
+    assert_found(fit, truth, 0.3 if kind in ("white", "outliers") else 0.45)
+    assert errors_of(fit, truth)[1][1] < 0.005
     assert np.count_nonzero(~fit.used) > 60 if kind == "outliers" else np.count_nonzero(~fit.used) < 20
 
 
@@ -56,9 +60,7 @@ def test_across_a_gap_of_the_dvl_nothing_is_concluded():
     stamps, velocity, quaternion, fixes = driven(rng, 1800.0, truth=truth)
     seconds = 1e-9 * (stamps - stamps[0])
     kept = ((seconds < 500.0) | (seconds > 560.0)) & ((seconds < 1100.0) | (seconds > 1130.0))
-    fit = fitted(Driven(stamps[kept], velocity[kept], quaternion[kept], fixes))
-    error, std = errors_of(fit, truth)
-    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.4
+    assert_found(fitted(Driven(stamps[kept], velocity[kept], quaternion[kept], fixes)), truth, 0.4)
 
 
 def test_fixes_come_seldom_with_dropouts_and_a_slow_dvl():
@@ -66,8 +68,7 @@ def test_fixes_come_seldom_with_dropouts_and_a_slow_dvl():
     truth = Truth((0.0, 0.0, -0.03), 0.004, (1.0, 0.0, 0.0), 1.0)
     stamps, velocity, quaternion, fixes = driven(rng, 1800.0, fix_s=10.0, dvl_hz=1.0, truth=truth)
     heard = rng.random(len(fixes.stamps_ns)) < 0.6
-    error, std = errors_of(fitted(Driven(stamps, velocity, quaternion, fixes.part(np.flatnonzero(heard)))), truth)
-    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.5
+    assert_found(fitted(Driven(stamps, velocity, quaternion, fixes.part(np.flatnonzero(heard)))), truth, 0.5)
 
 
 def test_noise_for_minutes_far_from_the_rest_is_left_out():
@@ -78,9 +79,8 @@ def test_noise_for_minutes_far_from_the_rest_is_left_out():
     bad = slice(400, 450)
     fixes.position[bad] += [-14.0, 6.0, 0.0]
     fit = fitted(Driven(stamps, velocity, quaternion, fixes))
-    error, std = errors_of(fit, truth)
     assert not fit.used[bad].any()
-    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.3
+    assert_found(fit, truth, 0.3)
 
 
 def test_rows_one_by_one_give_what_columns_give_whenever_fixes_come():
@@ -112,9 +112,7 @@ def test_a_dvl_with_hundreds_of_gaps_and_fixes_of_garbage_are_no_matter():
     seconds = 1e-9 * (stamps - stamps[0])
     kept = (seconds % 9.0 > 4.0) | (seconds < 1500.0)
     fixes.position[40], fixes.position[900] = [1e300, 0.0, 0.0], [np.nan, 1.0, 0.0]
-    fit = fitted(Driven(stamps[kept], velocity[kept], quaternion[kept], fixes))
-    error, std = errors_of(fit, truth)
-    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.4
+    assert_found(fitted(Driven(stamps[kept], velocity[kept], quaternion[kept], fixes)), truth, 0.4)
 
 
 def test_nothing_is_found_of_too_few_fixes_or_of_fixes_all_alike():

@@ -42,12 +42,7 @@ def sound() -> tuple[Calibrator, int]:
 @pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("kind", "number", "stamp_ns"),
-    [
-        (DvlSample, 0, IN_1970),
-        (DvlSample, 75, IN_2038),
-        (ImuSample, 0, IN_1970),
-        (ReferenceSample, 75, IN_2038),
-    ],
+    [(DvlSample, 0, IN_1970), (DvlSample, 75, IN_2038), (ImuSample, 0, IN_1970), (ReferenceSample, 75, IN_2038)],
 )
 def test_one_stray_stamp_changes_nothing(kind, number, stamp_ns):
     samples = list(run(SECONDS))

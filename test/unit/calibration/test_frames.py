@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting, correction_jacobian, distort
+from dvl_calib_ros.calibration.numerics.error_model import correct, corrected_mounting, correction_jacobian, distort
 from dvl_calib_ros.calibration.numerics.frames import (
     ENU_FROM_NED,
     FLU_FROM_FRD,
@@ -86,8 +86,6 @@ def test_corrected_mounting_is_the_rotation_nearest_to_the_error_model(rng):
 
 
 def test_correction_jacobian_is_the_derivative_of_the_correction(rng):
-    from dvl_calib_ros.calibration.numerics.error_model import correct
-
     velocity, mounting = rng.normal(size=3), rotation_from_rpy([0.3, -0.1, 2.0]).T
     jacobian, step = correction_jacobian(velocity, mounting), 1e-6
     for column in range(6):
@@ -98,8 +96,6 @@ def test_correction_jacobian_is_the_derivative_of_the_correction(rng):
 
 
 def test_distort_and_correct_are_exact_inverses(rng):
-    from dvl_calib_ros.calibration.numerics.error_model import correct
-
     errors = rng.normal(0, 0.2, 3), rng.normal(0, 0.1, 3), rotation_from_rpy([1, 2, 3]).T
     velocity = rng.normal(size=(50, 3))
     np.testing.assert_allclose(correct(distort(velocity, *errors), *errors), velocity, atol=1e-12)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
+from itertools import count
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from runs import START_NS, calibrate, feed, feed_columns, shifted
+from runs import SECOND, START_NS, altered, calibrate, feed, feed_columns, pushed, shifted, without
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.estimator import AtOnce
@@ -162,12 +163,8 @@ def test_stamps_so_late_that_nothing_pairs_are_no_outage():
 
 def test_references_that_are_wrong_for_half_a_minute_do_not_turn_the_mounting():
     """By 5 m/s, all of them: within their sections they agree, so only what lasts longer tells."""
-    spoilt = [
-        sample._replace(velocity=tuple(np.add(sample.velocity, [5.0, 0.0, 0.0]).tolist()))
-        if isinstance(sample, ReferenceSample) and 80_000_000_000 < sample.stamp_ns - START_NS < 110_000_000_000
-        else sample
-        for sample in late(-1.4)
-    ]
+    wrong = range(START_NS + 80 * SECOND, START_NS + 110 * SECOND)
+    spoilt = pushed(late(-1.4), ReferenceSample, lambda sample: [5.0 * (sample.stamp_ns in wrong), 0.0, 0.0])
     estimate = calibrate(spoilt, NOISE).estimate("full")
     error = estimate.state[:3] - PHI
     assert np.all(np.abs(error) < 3.5 * estimate.std[:3])
@@ -334,14 +331,8 @@ def test_after_a_restart_the_state_is_that_of_a_calibration_that_began_there():
 
 
 def test_outliers_are_gated_and_a_large_effect_is_not_taken_for_them():
-    samples = late(-1.4)
     rng = np.random.default_rng(1)
-    spoilt = [
-        sample._replace(velocity=tuple(np.add(sample.velocity, rng.normal(0.0, 2.0, 3)).tolist()))
-        if isinstance(sample, ReferenceSample) and rng.random() < 0.05
-        else sample
-        for sample in samples
-    ]
+    spoilt = pushed(late(-1.4), ReferenceSample, lambda _: (rng.random() < 0.05) * rng.normal(0.0, 2.0, 3))
     estimate = calibrate(spoilt, NOISE).estimate("full")
     assert 0.02 < estimate.gated / (estimate.used + estimate.gated) < 0.12
     np.testing.assert_allclose(estimate.state[BEYOND[:2]], LEVER_ARM[:2], atol=0.1)
@@ -381,11 +372,8 @@ def test_a_slow_dvl_that_is_off_now_and_then_costs_no_calibration():
 @pytest.mark.parametrize(("from_s", "to_s"), [(56.0, 74.0), (40.0, 90.0)])
 def test_a_gap_of_the_dvl_ends_no_calibration(from_s, to_s):
     """The bottom was lost for 18 s about a block: replay and diagnosis ended in a traceback."""
-
-    def is_received(sample):
-        return not isinstance(sample, DvlSample) or not from_s < 1e-9 * (sample.stamp_ns - START_NS) < to_s
-
-    calibrator = feed(Calibrator(Parameters(model="full")), [each for each in late(0.2) if is_received(each)])
+    received = without(late(0.2), DvlSample, lambda at: from_s < at < to_s)
+    calibrator = feed(Calibrator(Parameters(model="full")), received)
     assert calibrator.estimate("full").used > 300
 
 
@@ -408,12 +396,8 @@ def test_an_axis_that_the_reference_does_not_measure_is_not_judged_however_the_v
     """A vertical of 1e6 (m/s)² tilted by 2° is 1e3 (m/s)² of the body's horizontal, which was predicted as an error."""
     in_full = judged(claiming(late(-1.4), GNSS_STD**2 * np.eye(3)))
     claimed = claiming(late(-1.4), np.diag([GNSS_STD**2, GNSS_STD**2, 1e6]))
-    level = judged(
-        [
-            s._replace(velocity=(*s.velocity[:2], vertical(i))) if isinstance(s, ReferenceSample) else s
-            for i, s in enumerate(claimed)
-        ]
-    )
+    number = count()
+    level = judged(altered(claimed, ReferenceSample, velocity=lambda s: (*s.velocity[:2], vertical(next(number)))))
     assert in_full.verdict.value == level.verdict.value == "accept"
     assert level.held_out.samples == in_full.held_out.samples
     two_axes_of_three = np.sqrt(2.0 / 3.0)
@@ -427,20 +411,13 @@ def test_rates_that_are_differences_of_a_noisy_attitude_do_not_make_a_good_calib
     angles = rng.normal(0.0, 0.001, (3001, 3))
     noise = iter(np.diff(angles, axis=0) / 0.05)
     samples = claiming(late(-1.4), GNSS_STD**2 * np.eye(3))
-    noisy = judged(
-        [
-            s._replace(angular_velocity=tuple((np.array(s.angular_velocity) + next(noise)).tolist()))
-            if isinstance(s, ImuSample)
-            else s
-            for s in samples
-        ]
-    )
+    noisy = judged(altered(samples, ImuSample, angular_velocity=lambda s: tuple(s.angular_velocity + next(noise))))
     assert noisy.verdict.value == "accept"
     assert noisy.held_out.corrected < 1.3 * judged(samples).held_out.corrected
 
 
 def claiming(samples, covariance):
-    return [s._replace(covariance=covariance) if isinstance(s, ReferenceSample) else s for s in samples]
+    return altered(samples, ReferenceSample, covariance=covariance)
 
 
 def judged(samples):
@@ -459,6 +436,51 @@ def test_intervals_hold_what_they_say_over_40_runs():
     share = np.mean(np.abs(scores) < 1.96, axis=0)
     assert np.all((share > 0.87) & (share <= 1.0)), share
     assert 0.92 < np.mean(share) < 0.99, share
+
+
+# ---------------------------------------------------------------------- a clock that is late
+
+
+@cache
+def late_reference(seconds: float = 0.6):
+    """A run whose reference is late, and what is made of it; not to be fed any more."""
+    samples = sorted(shifted(late(0.0), round(1e9 * seconds), ReferenceSample), key=lambda sample: sample.stamp_ns)
+    return samples, calibrate(samples, NOISE, verified=True)
+
+
+def test_a_late_reference_is_named_and_bends_no_lever_arm():
+    _, calibrator = late_reference()
+    assert abs(calibrator.estimate("full").state[5] - LEVER_ARM[0]) < 0.1
+    said = calibrator.suggestion
+    assert said is not None and said.code == "CLOCK_LATE"
+    assert (said.numbers["whose"], said.numbers["way"]) == ("the reference's", "late")
+    assert said.numbers["parameter"] == "reference_time_offset"
+    assert said.numbers["offset"] == pytest.approx(0.6, abs=0.05)
+    verification = calibrator.verification("full")
+    assert verification.verdict is Severity.REJECT
+    assert verification.reasons[0].causes == (said,) and said.sentence in verification.reasons[0].sentence
+
+
+def test_what_it_says_makes_the_calibration_right():
+    samples, calibrator = late_reference()
+    offset = calibrator.suggestion.numbers["offset"]
+    calibrator = calibrate(samples, NOISE.replace(reference_time_offset=offset), verified=True)
+    assert calibrator.suggestion is None
+    assert calibrator.verification("full").verdict is Severity.ACCEPT
+    np.testing.assert_allclose(calibrator.estimate("full").state[5:7], LEVER_ARM[:2], atol=0.1)
+
+
+def test_a_reference_that_is_late_by_more_than_any_delay_of_the_dvl_is_named_as_well():
+    """It was said to be 1.2 s late or more, or nothing."""
+    said = late_reference(30.0)[1].suggestion
+    assert said is not None and said.numbers["parameter"] == "reference_time_offset"
+    assert said.numbers["offset"] == pytest.approx(30.0, abs=0.05)
+
+
+@pytest.mark.slow
+def test_how_samples_are_gathered_changes_nothing_about_clocks():
+    samples, calibrator = late_reference()
+    assert calibrate(samples, NOISE, verified=True, block_size=400).suggestion == calibrator.suggestion
 
 
 # ---------------------------------------------------------------------- parts

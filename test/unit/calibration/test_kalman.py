@@ -39,11 +39,14 @@ def test_the_filter_equals_weighted_least_squares(rng, weights):
 def test_least_squares_over_growing_windows_equals_the_filter_after_each(rng, weights):
     x, p, data = random_problem(rng, weights=weights)
     ends = [0, 1, 40, 150]
-    after = kalman.least_squares(x, p, data, ends)
+    assert_of_filters_stopped(kalman.least_squares(x, p, data, ends), x, p, data, ends, 1e-12)
+
+
+def assert_of_filters_stopped(found, x, p, data, ends, atol: float) -> None:
     for index, end in enumerate(ends):
-        expected = kalman.recursion(x, p, data.part(slice(0, end)))
-        np.testing.assert_allclose(after.x[index], expected.x, atol=1e-12)
-        np.testing.assert_allclose(after.p[index], expected.p, atol=1e-12)
+        stopped = kalman.recursion(x, p, data.part(slice(0, end)))
+        np.testing.assert_allclose(found.x[index], stopped.x, atol=atol)
+        np.testing.assert_allclose(found.p[index], stopped.p, atol=atol)
 
 
 @searched(30)
@@ -58,6 +61,10 @@ def test_least_squares_over_growing_windows_equals_the_filter_after_each(rng, we
 )
 def test_the_batch_equals_the_filter_whatever_the_gate_decides(seed, n_samples, n, m, outliers, gate, weights):
     x, p, data = random_problem(np.random.default_rng(seed), 2, n_samples, n, m, outliers, weights, gate)
+    assert_batch_is_filter(x, p, data)
+
+
+def assert_batch_is_filter(x, p, data):
     one, all_at_once = kalman.recursion(x, p, data), kalman.batch(x, p, data)
     np.testing.assert_array_equal(one.used, all_at_once.used)
     np.testing.assert_allclose(one.x, all_at_once.x, atol=1e-10)
@@ -70,11 +77,7 @@ def test_states_that_no_sample_sees_follow_those_that_they_are_correlated_with(r
     x, p, data = random_problem(rng, outliers=0.05, gate=16.3, weights=True)
     data.h[..., unseen] = 0.0
     root = 0.05 * rng.normal(size=p.shape)
-    p = root @ root.swapaxes(1, 2) + 1e-4 * np.eye(4)
-    one, all_at_once = kalman.recursion(x, p, data), kalman.batch(x, p, data)
-    np.testing.assert_array_equal(one.used, all_at_once.used)
-    np.testing.assert_allclose(one.x, all_at_once.x, atol=1e-10)
-    np.testing.assert_allclose(one.p, all_at_once.p, atol=1e-10)
+    assert_batch_is_filter(x, root @ root.swapaxes(1, 2) + 1e-4 * np.eye(4), data)
 
 
 @pytest.mark.parametrize("way", [kalman.batch, lambda x, p, data, ends: kalman.recursion(x, p, data, None, ends)])
@@ -82,11 +85,7 @@ def test_states_that_no_sample_sees_follow_those_that_they_are_correlated_with(r
 def test_the_states_on_the_way_are_those_of_a_filter_stopped_there(rng, outliers, gate, way):
     x, p, data = random_problem(rng, n_samples=40, outliers=outliers, gate=gate, weights=True)
     ends = np.array([0, 1, 1, 17, 40])
-    found = way(x, p, data, ends).at
-    for index, end in enumerate(ends):
-        stopped = kalman.recursion(x, p, data.part(slice(0, end)))
-        np.testing.assert_allclose(found.x[index], stopped.x, atol=1e-10)
-        np.testing.assert_allclose(found.p[index], stopped.p, atol=1e-10)
+    assert_of_filters_stopped(way(x, p, data, ends).at, x, p, data, ends, 1e-10)
 
 
 def test_gating_that_does_not_settle_falls_back_to_the_filter(rng, monkeypatch):

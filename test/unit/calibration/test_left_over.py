@@ -243,15 +243,10 @@ def test_an_attitude_without_tilt_and_a_short_run_say_nothing(rng):
     assert Vehicle(rng, seconds=60.0).found() is None and residual_warnings(None) == []
 
 
-def past_noise(noise, seconds):
-    """What a filter that an IMU carries over the vehicle's own motion keeps of the DVL's noise."""
-    return smoothed(noise, seconds)
-
-
 @pytest.mark.parametrize("seconds", [0.4, 1.0])
 def test_a_reference_that_follows_the_noise_of_the_dvl_is_made_from_it(rng, seconds):
     vehicle = Vehicle(rng)
-    kept = past_noise(vehicle.noise[1], seconds)
+    kept = smoothed(vehicle.noise[1], seconds)  # by a filter that an IMU carries over the vehicle's own motion
     vehicle.noise = 0.3 * vehicle.noise[0], vehicle.noise[1]
     found = vehicle.found(reference=vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, kept))
     assert found.circular > 0.0
@@ -262,7 +257,7 @@ def test_a_reference_that_follows_the_noise_of_the_dvl_is_made_from_it(rng, seco
 def test_a_reference_that_moves_by_more_than_the_noise_of_the_dvl_is_no_filter_of_it(rng):
     """A boat's reference followed 2.5 times what a quiet DVL's neighbours left of waves; a filter keeps less than 1."""
     vehicle = Vehicle(rng)
-    kept = 3.0 * past_noise(vehicle.noise[1], 1.0) / STEP_S
+    kept = 3.0 * smoothed(vehicle.noise[1], 1.0) / STEP_S
     vehicle.noise = 0.3 * vehicle.noise[0], vehicle.noise[1]
     found = vehicle.found(reference=vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, kept))
     assert "CIRCULAR_REFERENCE" not in [each.code for each in residual_warnings(found)]

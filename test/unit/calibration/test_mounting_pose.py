@@ -97,8 +97,7 @@ def test_scale_and_delay_are_what_was_set_and_what_was_found(rng):
 
 
 @pytest.mark.parametrize(
-    "rpy",
-    [*((0.0, 0.0, np.radians(yaw)) for yaw in (0, 30, 45, 90, 180)), (0.3, -0.2, 2.1), (np.pi, 0.0, -np.pi / 2)],
+    "rpy", [*((0.0, 0.0, np.radians(yaw)) for yaw in (0, 30, 45, 90, 180)), (0.3, -0.2, 2.1), (np.pi, 0.0, -np.pi / 2)]
 )
 def test_the_std_of_roll_pitch_and_yaw_is_that_of_angles_drawn_from_the_state(rng, rpy):
     """Of a DVL at 45 degrees, a roll of the body that is not known is as much pitch as roll."""

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from runs import START_NS, calibrate, feed_columns, shifted
+from runs import START_NS, altered, calibrate, feed_columns, pushed, shifted
 from test_full import LEVER_ARM, NOISE, PHI, late
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
@@ -15,7 +15,7 @@ from dvl_calib_ros.calibration.models.own import DELAY, FULL
 from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
-from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.streams.stream_order import NewDays
 
 SECOND_NS = 1_000_000_000
@@ -25,12 +25,7 @@ DELAYS = (-1.4, 0.6)
 
 def off(samples, east_north):
     """The same with a reference that is off by so much all along, m/s."""
-    return [
-        sample._replace(velocity=tuple(np.add(sample.velocity, [*east_north, 0.0]).tolist()))
-        if isinstance(sample, ReferenceSample)
-        else sample
-        for sample in samples
-    ]
+    return pushed(samples, ReferenceSample, lambda _: [*east_north, 0.0])
 
 
 @cache
@@ -105,9 +100,7 @@ def test_a_day_that_shows_no_delay_claims_none_and_the_lever_arm_stays():
     calibrator = Calibrator(NOISE)
     feed_columns(calibrator, late(DELAYS[0]))
     before = calibrator.estimate("full")
-    slow = [
-        sample._replace(velocity=(0.1, 0.0, 0.0)) if hasattr(sample, "velocity") else sample for sample in late(0.0)
-    ]
+    slow = altered(late(0.0), (DvlSample, ReferenceSample), velocity=(0.1, 0.0, 0.0))
     feed_columns(calibrator, shifted(slow, NIGHT_NS))
     after = calibrator.estimate("full")
     # the last blocks of the first day were still waiting for what may belong to them

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from runs import MatchedRun, calibrate, make_samples, only
+from runs import START_NS, MatchedRun, calibrate, make_samples, only
 
+from dvl_calib_ros.calibration.filters.filter_bank import LONGEST_STEP_S, MEMORY_S, RelativeHeight
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import correct
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.simulation.sensors import DvlErrors, equivalent_error_terms, measure_dvl
 
 SECOND = 1_000_000_000
@@ -78,12 +80,17 @@ def run_without_gnss(headings_deg, current_enu, misalignment, rng, trim=0.0, sec
         heading = np.deg2rad(headings_deg[i // seconds_each])
         rotation = rotation_from_rpy((0.0, -trim, heading))
         east, north = 1.5 * np.cos(heading) + current_enu[0], 1.5 * np.sin(heading) + current_enu[1]
-        velocity_body = rotation.T @ np.array([east, north, 0.0])
-        velocity_body = velocity_body + rng.normal(0, 0.01, 3)
-        measured = velocity_body + np.cross(misalignment, velocity_body)
-        samples.append(ImuSample(i * SECOND, quaternion_from_rotation(rotation), (0.0, 0.0, 0.0)))
-        samples.append(DvlSample(i * SECOND, tuple(measured.tolist())))
+        samples += seen(i, rotation, rotation.T @ np.array([east, north, 0.0]), misalignment, rng)
     return samples
+
+
+def seen(second: int, rotation, velocity_body, misalignment, rng):
+    """The samples of IMU and DVL at a time."""
+    velocity = velocity_body + rng.normal(0, 0.01, 3)
+    measured = velocity + np.cross(misalignment, velocity)
+    orientation = quaternion_from_rotation(rotation)
+    stamp_ns = second * SECOND
+    return ImuSample(stamp_ns, orientation, (0.0, 0.0, 0.0)), DvlSample(stamp_ns, tuple(measured.tolist()))
 
 
 def test_two_headings_tell_yaw_from_a_current(rng):
@@ -110,10 +117,7 @@ def run_through_a_shear(misalignment, rng):
         rising = 0.25 * (1.0 if i // 50 % 4 in (0, 3) else -1.0) * (i // 100 % 4 < 2 or i // 50 % 2)
         height += rising
         rotation = rotation_from_rpy((0.0, -np.arcsin(rising / 1.5), heading))
-        velocity_body = rotation.T @ (0.0, 0.01 * height, 0.0) + (1.5, 0.0, 0.0) + rng.normal(0, 0.01, 3)
-        measured = velocity_body + np.cross(misalignment, velocity_body)
-        samples.append(ImuSample(i * SECOND, quaternion_from_rotation(rotation), (0.0, 0.0, 0.0)))
-        samples.append(DvlSample(i * SECOND, tuple(measured.tolist())))
+        samples += seen(i, rotation, rotation.T @ (0.0, 0.01 * height, 0.0) + (1.5, 0.0, 0.0), misalignment, rng)
     return samples
 
 
@@ -181,11 +185,6 @@ def test_an_imu_that_starts_late_changes_little(rng):
     assert part.misalignment[2] == pytest.approx(0.04, abs=0.006)
 
 
-def test_with_gnss_auto_runs_full():
-    segments = calibrate(make_samples(MatchedRun("box", 120.0, gnss_std=0.05))).selection.segments
-    assert [segment.model for segment in segments] == ["unaided", "full"]
-
-
 def test_unaided_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
     samples = run_without_gnss((20.0,), (0.0, 0.0), (0.0, 0.03, -0.04), rng, seconds_each=400)
     calibrator = calibrate(samples, Parameters(current_std=0.05))
@@ -206,3 +205,88 @@ def test_corrected_velocities_use_the_errors_not_the_nuisance():
     velocity = np.array([[1.5, 0.1, 0.0]])
     expected = correct(velocity, estimate.state[:3], np.zeros(3), np.eye(3))
     np.testing.assert_array_equal(estimate.corrected_velocity(velocity, np.eye(3)), expected)
+
+
+# ---------------------------------------------------------------------- unaided: the path is level
+
+
+STEP_S, SPEED = 0.2, 1.4
+ROLL, PITCH, YAW = (math.radians(each) for each in (0.5, -1.0, 2.0))
+
+
+def pitch_found(climb, error_up: float) -> tuple[float, float]:
+    """Return error and σ of the pitch, degrees, of legs to four courses. climb: m/s of times (N,) s."""
+    rng = np.random.default_rng(4)
+    time = np.arange(0.0, 480.0, STEP_S)
+    course = np.convolve(np.radians(90.0) * (time // 60.0), np.ones(20) / 20.0, "same")
+    up = climb(time)
+    roll = 0.02 * np.sin(1.2 * time)
+    pitch = 0.02 * np.sin(time) - np.arcsin(up / SPEED)
+    turns = np.array([rotation_from_rpy(each) for each in zip(roll, pitch, course, strict=True)])
+    earth = np.column_stack([SPEED * np.cos(course), SPEED * np.sin(course), up])
+    body = np.einsum("nji,nj->ni", turns, earth)
+    change = np.einsum("nji,njk->nik", turns[:-1], turns[1:]) / STEP_S
+    rates = np.column_stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]])
+    rates = np.vstack([rates, rates[-1:]])
+    dvl = body @ rotation_from_rpy((ROLL, PITCH, YAW)) + rng.normal(0.0, 0.01, body.shape)
+    reference = earth + np.array([0.0, 0.0, error_up]) + rng.normal(0.0, 0.02, earth.shape)
+    samples: list[DvlSample | ReferenceSample | ImuSample] = []
+    for at in range(len(time)):
+        stamp = START_NS + round(1e9 * time[at])
+        samples.append(ImuSample(stamp, quaternion_from_rotation(turns[at]), tuple(rates[at])))
+        samples.append(ReferenceSample(stamp, tuple(reference[at]), None, VelocityFrame.ENU))
+        samples.append(DvlSample(stamp + 1000, tuple(dvl[at])))
+    calibrator = calibrate(samples, Parameters())
+    calibrator.finish()
+    estimate = calibrator.result().estimate
+    return math.degrees(-estimate.misalignment[1] - PITCH), math.degrees(estimate.recording_std[1])
+
+
+def test_a_vertical_error_of_the_reference_does_not_turn_a_level_vehicles_pitch():
+    off, std = pitch_found(lambda time: 0.0 * time, 0.06)
+    assert abs(off) < min(2.0 * std, 0.5) and std < 0.7  # of 0.06 m/s it would be 2.5 degrees
+
+
+@pytest.mark.spread(1)
+@pytest.mark.parametrize(
+    "climb",
+    [
+        pytest.param(lambda time: np.where(time < 60.0, -0.17, 0.0), id="dives, then level"),
+        pytest.param(lambda time: 0.15 * np.sin(0.03 * time), id="yo-yo"),
+    ],
+)
+def test_a_vehicle_that_dives_keeps_its_pitch(climb):
+    off, std = pitch_found(climb, 0.0)
+    assert abs(off) < 2.0 * std and abs(off) < 1.0
+
+
+# ---------------------------------------------------------------------- relative height
+
+
+def test_a_vehicle_that_rises_is_higher_by_as_much_and_in_what_blocks_it_comes_changes_nothing(rng):
+    stamps_ns = np.cumsum(rng.integers(SECOND // 10, SECOND, 40))
+    rising = rng.normal(0.0, 0.3, 40)
+    whole = RelativeHeight().add(stamps_ns, rising)
+    parts = RelativeHeight()
+    np.testing.assert_array_equal(
+        np.concatenate([parts.add(stamps_ns[at], rising[at]) for at in (slice(0, 1), slice(1, 17), slice(17, 40))]),
+        whole,
+    )
+    steps = np.diff(stamps_ns, prepend=stamps_ns[0]) * 1e-9
+    np.testing.assert_allclose(whole, np.cumsum(rising * steps), atol=0.3)  # nearly nothing is forgotten in 20 s
+
+
+def test_a_velocity_that_is_wrong_by_a_constant_adds_up_to_a_constant():
+    stamps_ns = SECOND * np.arange(2000)
+    heights = RelativeHeight().add(stamps_ns, np.full(2000, 0.05))
+    assert heights[-1] == pytest.approx(0.05 * MEMORY_S, rel=1e-3)
+    assert np.ptp(heights[1000:]) < 1e-3
+
+
+def test_of_a_gap_nobody_knows_how_far_it_rose():
+    height = RelativeHeight()
+    before = height.add(SECOND * np.arange(10), np.full(10, 0.5))[-1]
+    after = height.add(np.array([9 * SECOND + round((LONGEST_STEP_S + 1.0) * 1e9)]), np.array([0.5]))[0]
+    assert 0.9 * before < after < before
+    height.end_day()
+    assert height.add(np.array([0]), np.array([0.5]))[0] == 0.0

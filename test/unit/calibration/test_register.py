@@ -14,13 +14,7 @@ from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.registration import registration
 from dvl_calib_ros.calibration.registration.configuration_check import SIGNS, fitting_configuration, wrong_axes
 from dvl_calib_ros.calibration.registration.delay_search import FARTHEST_S, _minima, candidate_delays
-from dvl_calib_ros.calibration.registration.gauss_newton import (
-    DELTA,
-    DVL,
-    REFERENCE,
-    RHO,
-    MotionFit,
-)
+from dvl_calib_ros.calibration.registration.gauss_newton import DELTA, DVL, REFERENCE, RHO, MotionFit
 from dvl_calib_ros.calibration.registration.motion_streams import Curves, MotionStreams, make_motion
 from dvl_calib_ros.calibration.registration.registration import (
     Clock,
@@ -35,16 +29,19 @@ from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
 ARM = -0.6
+ONE_ARM = (injection(f"lever_arm:x_m={ARM}"),)
+ERRORS = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.005)
 
 
 @cache
 def run(trajectory: str, rate: float, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)):
     """Times and values of the streams of a run of ten minutes."""
-    errors = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.005)
-    arm = injection(f"lever_arm:x_m={ARM}")
-    simulated = simulate(
-        Scenario(trajectory, 600.0, 3, errors, mounting, gnss_std=0.05, gnss_rate=rate, dvl_rate=rate, effects=(arm,))
-    )
+    given = {"mounting_rpy": mounting, "gnss_std": 0.05, "gnss_rate": rate, "dvl_rate": rate}
+    return columns_of(Scenario(trajectory, 600.0, 3, ERRORS, effects=ONE_ARM, **given))
+
+
+def columns_of(scenario: Scenario):
+    simulated = simulate(scenario)
     first_ns = simulated.dvl[0].stamp_ns
 
     def columns(samples, *fields):
@@ -97,6 +94,10 @@ def test_two_late_clocks_are_told_apart(seconds):
     assert found.dvl.is_shown and found.reference.is_shown
     assert found.dvl.delay_s == pytest.approx(dvl, abs=max(0.1, 4.0 * found.dvl.std))
     assert found.reference.delay_s == pytest.approx(reference, abs=max(0.1, 4.0 * found.reference.std))
+    said = found.contradiction(Parameters())
+    assert said is not None and said.code == "CLOCKS_LATE"
+    assert said.numbers["dvl_way"] == ("early" if dvl < 0.0 else "late")
+    assert (said.numbers["seconds"], said.numbers["dvl_seconds"]) == pytest.approx((reference, abs(dvl)), abs=0.1)
 
 
 @pytest.mark.parametrize("seconds", [-0.6, 0.5, 4.0])
@@ -210,26 +211,9 @@ def test_nothing_is_taken_off_where_a_leg_does_not_show_its_clocks(seed):
 def test_sigmas_of_the_clocks_and_the_arm_are_what_runs_scatter_by():
     z = []
     for seed in range(12):
-        errors = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.005)
-        scenario = Scenario("box", 300.0, seed, errors, gnss_std=0.1, effects=(injection(f"lever_arm:x_m={ARM}"),))
-        simulated = simulate(scenario)
-        first_ns = simulated.dvl[0].stamp_ns
-
-        def column(samples, field, first_ns=first_ns):
-            return np.array([getattr(sample, field) for sample in samples]), np.array(
-                [1e-9 * (sample.stamp_ns - first_ns) for sample in samples]
-            )
-
-        (v, td), (g, tg), (q, ti) = (
-            column(samples, field)
-            for samples, field in (
-                (simulated.dvl, "velocity"), (simulated.gnss, "velocity"), (simulated.imu, "orientation")
-            )
-        )  # fmt: skip
-        w, _ = column(simulated.imu, "angular_velocity")
-        found = register(
-            make_motion((td, v), (tg + 3.0, g), True, (True,) * 3, ImuColumns(ti, q, w)), np.eye(3), np.zeros(3)
-        )
+        dvl, (tg, g), imu = columns_of(Scenario("box", 300.0, seed, ERRORS, gnss_std=0.1, effects=ONE_ARM))
+        late = make_motion(dvl, (tg + 3.0, g), True, (True,) * 3, ImuColumns(*imu))
+        found = register(late, np.eye(3), np.zeros(3))
         z.append([(found.reference.delay_s - 3.0) / found.reference.std,
                   (found.lever_arm[0] - ARM) / found.lever_arm_std[0]])  # fmt: skip
     rms = np.sqrt((np.array(z) ** 2).mean(axis=0))
@@ -284,6 +268,13 @@ def _of_its_own(one: MotionStreams) -> MotionStreams:
     return replace(one, reference_times=one.dvl.times[known], reference=seen)
 
 
+def heaving():
+    """A vehicle that heaves, which shows the sign of z as its sway does that of y."""
+    (td, v), (tg, g), imu = run("free", 5.0)
+    v, g = (each + np.outer(np.sin(2.0 * np.pi * t / 7.3), [0.0, 0.0, 0.1]) for t, each in ((td, v), (tg, g)))
+    return (td, v), (tg, g), ImuColumns(*imu)
+
+
 MIRRORED = {
     (1.0, 1.0, 1.0): None, (1.0, -1.0, 1.0): "y", (-1.0, -1.0, -1.0): "each of x, y and z",
 }  # fmt: skip
@@ -293,12 +284,8 @@ MIRRORED = {
 @pytest.mark.parametrize(("signs", "axis"), MIRRORED.items())
 def test_a_left_handed_driver_is_named_with_its_axis(signs, axis):
     """An arm of -0.52 m ± 0.08 for 0.60 and a yaw 4.3 degrees off were marginal, a pitch 2 degrees off accepted."""
-    (td, v), (tg, g), imu = run("free", 5.0)
-    # a vehicle that heaves, which shows the sign of z as its sway does that of y
-    level = np.array([[0.0, 0.0, 0.1]])
-    v = v + level * np.sin(2.0 * np.pi * td / 7.3)[:, None]
-    heave = level * np.sin(2.0 * np.pi * tg / 7.3)[:, None]
-    made = make_motion((td, v * signs), (tg, g + heave), True, (True,) * 3, ImuColumns(*imu))
+    (td, v), reference, imu = heaving()
+    made = make_motion((td, v * signs), reference, True, (True,) * 3, imu)
     found = register(made, np.eye(3), np.zeros(3))
     said = fitting_configuration(made, VelocityFrame.ENU, found, Parameters())
     assert (said and (said.code, said.numbers)) == (axis and ("DVL_LEFT_HANDED", {"axis": axis, "alike": ""}))
@@ -311,12 +298,9 @@ QUARTER = Parameters(mounting_rpy=(0.0, 0.0, 0.5 * np.pi))
 
 def test_a_left_handed_driver_at_90_degrees_is_named_with_its_axis():
     """With x mirrored it was accepted, with a yaw 6 degrees off."""
-    (td, v), (tg, g), imu = run("free", 5.0)
+    (td, v), reference, imu = heaving()
     quarter = rotation_from_rpy((0.0, 0.0, 0.5 * np.pi))
-    heave = np.array([[0.0, 0.0, 0.1]])
-    v = v + heave * np.sin(2.0 * np.pi * td / 7.3)[:, None]
-    g = g + heave * np.sin(2.0 * np.pi * tg / 7.3)[:, None]
-    made = make_motion((td, (v @ quarter) * [-1.0, 1.0, 1.0]), (tg, g), True, (True,) * 3, ImuColumns(*imu))
+    made = make_motion((td, (v @ quarter) * [-1.0, 1.0, 1.0]), reference, True, (True,) * 3, imu)
     found = register(made, quarter, np.zeros(3))
     said = fitting_configuration(made, VelocityFrame.ENU, found, QUARTER)
     assert said and (said.code, said.numbers) == ("DVL_LEFT_HANDED", {"axis": "x", "alike": ""})

@@ -104,7 +104,8 @@ def both(before):
 
 
 def generations(folder: Path) -> Path:
-    """A file and its two backups."""
+    """A file and its two backups in a new folder."""
+    folder.mkdir()
     path = folder / "result.yaml"
     for text in ("one", "two", "three"):
         save_bytes(path, text.encode(), both)
@@ -120,7 +121,6 @@ def no_links(*_, **__):
 
 
 def number_of_calls(folder: Path, has_links: bool = True) -> int:
-    folder.mkdir()
     path = generations(folder)
     with at_call(0, lambda: None) as made:
         save_bytes(path, b"four", both)
@@ -144,9 +144,7 @@ def test_whichever_call_of_a_save_fails_the_file_is_the_old_or_the_new_one_and_n
 
     refused = 0
     for number in range(1, count + 1):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        path = generations(folder)
+        path = generations(tmp_path / str(number))
         with at_call(number, fail) as made:
             try:
                 save_bytes(path, b"four", both)
@@ -158,7 +156,7 @@ def test_whichever_call_of_a_save_fails_the_file_is_the_old_or_the_new_one_and_n
         refused += not saved
         assert path.read_text() == ("four" if saved else "three"), made[number - 1]
         if not saved and made[number - 1] != "unlink":  # what could not be unlinked is taken by the next save
-            assert hidden(folder) == [] and (folder / "result.yaml.bak").read_text() == "two"
+            assert hidden(path.parent) == [] and path.with_name("result.yaml.bak").read_text() == "two"
         assert_next_save_tidies(path, ["three", "two"] if saved else ["three"])
     assert 5 <= refused < count
 
@@ -175,9 +173,7 @@ def test_at_whichever_call_a_save_is_killed_the_file_is_whole_and_the_next_save_
     count = number_of_calls(tmp_path / "count")
     seen = set()
     for number in range(1, count + 1):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        path = generations(folder)
+        path = generations(tmp_path / str(number))
         child = os.fork()
         if child == 0:
             with at_call(number, lambda: os.kill(os.getpid(), signal.SIGKILL)):

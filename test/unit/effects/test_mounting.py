@@ -47,8 +47,7 @@ def test_a_mounting_that_moved_is_that_of_the_angles_added_to_the_last_digit():
 
 
 @pytest.mark.parametrize(
-    ("name", "size"),
-    [("mounting_moved", MOVED), ("misalignment_drift", 30.0 * MOVED), ("mount_flexure", MOVED)],
+    ("name", "size"), [("mounting_moved", MOVED), ("misalignment_drift", 30.0 * MOVED), ("mount_flexure", MOVED)]
 )
 def test_the_model_undoes_a_turned_mounting_beside_a_misalignment_and_its_columns_are_derivatives(name, size):
     one = injected(name, size)

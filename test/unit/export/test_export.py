@@ -252,11 +252,6 @@ def test_on_a_full_disk_neither_settings_nor_what_they_lack_are_written(diagnosi
     assert [each.name for each in tmp_path.iterdir()] == [diagnosis.name]
 
 
-def test_it_does_not_write_over_what_it_reads(diagnosis, capsys):
-    assert "would write over the input" in fail(capsys, "export", "gazebo", diagnosis, "-o", diagnosis)
-    assert "no-such" in fail(capsys, "export", "gazebo", diagnosis, "-o", diagnosis.parent / "no-such" / "dvl.sdf")
-
-
 @pytest.mark.slow
 def test_the_diagnosis_of_a_bag_says_what_the_export_needs(tmp_path, capsys):
     succeed(capsys, "simulate", tmp_path / "bag", "--trajectory", "free", "--duration", "200", "--gnss-std", "0.02",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import fail, succeed
-from log_fixtures import nortek
+from log_fixtures import ensemble, nortek
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.reader import BagReader
@@ -39,38 +38,6 @@ def report(i: int, velocity: Sequence[float], **changes) -> str:
 def water_linked(path: Path, *lines: str) -> Path:
     path.write_text("\n".join(lines) + "\n")
     return path
-
-
-def ensemble(
-    millimetres: Sequence[int],
-    hundredths: int,
-    axes: int = 2,
-    checksum: int = 0,
-    *,
-    configuration: tuple[int, int] = (0, 0),
-    flags: int = 0,
-    attitude: tuple[int, int, int] = (0, 0, 0),
-    length: int = 65,
-    alignment: int = 0,
-) -> bytes:
-    """A PD0 ensemble with fixed leader, variable leader and bottom track, by the format's table of bytes."""
-    fixed, variable, bottom = bytearray(59), bytearray(65), bytearray(81)
-    fixed[4:6] = bytes(configuration)
-    fixed[25] = axes << 3 | flags
-    struct.pack_into("<h", fixed, 26, alignment)
-    struct.pack_into("<H", variable, 0, 0x0080)
-    variable[4:11] = bytes([25, 11, 21, 10, 30, 15, hundredths])
-    struct.pack_into("<H2h", variable, 18, *attitude)
-    variable = variable[:length]
-    struct.pack_into("<H", bottom, 0, 0x0600)
-    struct.pack_into(f"<{len(millimetres)}h", bottom, 24, *millimetres)
-    # bottom track first, so that what is cut is at the end
-    offsets, at = [], 6 + 2 * 3
-    for part in (fixed, bottom, variable):
-        offsets.append(at)
-        at += len(part)
-    body = b"\x7f\x7f" + struct.pack("<HBB3H", at, 0, 3, *offsets) + bytes(fixed + bottom + variable)
-    return body + struct.pack("<H", (sum(body) + checksum) & 0xFFFF)
 
 
 def test_water_linked_reports_are_turned_to_forward_left_up_and_stamped_by_their_validity(tmp_path):

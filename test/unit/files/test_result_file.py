@@ -283,29 +283,26 @@ def test_an_empty_result_is_written_where_nothing_is_and_makes_room_without_a_tr
         assert uses(tmp_path) == left
 
 
-def test_a_run_that_is_saved_every_minute_does_not_push_out_the_good_one_before_it(tmp_path):
-    path = tmp_path / "r.yaml"
-    save_result(path, document(9000, "fine", first_ns=1), 3)
-    for used in range(1, 50):
-        save_result(path, document(used, "collecting", first_ns=2), 3)
-    assert uses(tmp_path) == [49, 48, 9000]
+SAVED = {  # samples used, convergence and run of each save, the backups that are asked for, and what is left
+    "one run, every minute, after a good one": (
+        [(9000, "fine", 1), *((used, "collecting", 2) for used in range(1, 50))], 3, [49, 48, 9000],
+    ),
+    "many runs": (
+        [(1, "fine", 1), (2, "fine", 2), (3, "coarse", 3), (4, "fine", 4), (5, "collecting", 5), (6, "coarse", 6),
+         (7, "collecting", 7)], 3, [7, 6, 4, 2],
+    ),
+    "as good ones": ([(used, "fine", used) for used in range(1, 6)], 4, [5, 4, 3, 2, 1]),
+}  # fmt: skip
 
 
-def test_of_many_runs_the_best_converged_are_kept_and_of_these_the_newest(tmp_path):
-    path = tmp_path / "r.yaml"
-    runs = [(1, "fine"), (2, "fine"), (3, "coarse"), (4, "fine"), (5, "collecting"), (6, "coarse"), (7, "collecting")]
-    for used, convergence in runs:
-        save_result(path, document(used, convergence, first_ns=used), 3)
-    assert uses(tmp_path) == [7, 6, 4, 2]
-
-
-def test_with_one_backup_it_is_the_file_before_and_with_fewer_than_there_are_the_others_go(tmp_path):
-    path = tmp_path / "r.yaml"
-    for used in range(1, 6):
-        save_result(path, document(used, "fine", first_ns=used), 4)
-    assert uses(tmp_path) == [5, 4, 3, 2, 1]
-    save_result(path, document(6, "fine", first_ns=6), 1)
-    assert uses(tmp_path) == [6, 5]
+@pytest.mark.parametrize("runs", SAVED)
+def test_of_many_runs_the_best_converged_are_kept_and_of_these_the_newest(tmp_path, runs):
+    saves, n_backups, left = SAVED[runs]
+    for used, convergence, first_ns in saves:
+        save_result(tmp_path / "r.yaml", document(used, convergence, first_ns), n_backups)
+    assert uses(tmp_path) == left
+    save_result(tmp_path / "r.yaml", document(8, "fine", first_ns=8), 1)
+    assert uses(tmp_path)[0] == 8 and len(uses(tmp_path)) == 2  # where fewer are asked for the others go
 
 
 RUNS = st.lists(st.tuples(st.integers(0, 50), st.sampled_from(["collecting", "coarse", "fine"])), max_size=12)

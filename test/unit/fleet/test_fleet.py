@@ -65,6 +65,12 @@ def made(dives, tmp_path_factory):
     return dc.fleet(dives, out, jobs=1), out
 
 
+@pytest.fixture
+def copied(made, tmp_path) -> Path:
+    """That folder for a test of its own."""
+    return Path(shutil.copytree(made[1], tmp_path / "out"))
+
+
 def test_a_row_is_a_recording_and_parameter_with_what_replay_says_of_it(made, dives):
     rows = table(made[1])
     assert not rows.duplicated(["recording", "parameter"]).any()
@@ -243,14 +249,12 @@ def test_what_recordings_say_of_the_water_is_in_rows_and_on_the_page(tmp_path):
     assert f"{USED:.1f} m/s" in page  # and not the usual 1500
 
 
-def test_a_part_of_another_schema_is_not_read(made, dives, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(made[1], out)
-    part = next((out / "rows").glob("dive0*"))
+def test_a_part_of_another_schema_is_not_read(copied, dives):
+    part = next((copied / "rows").glob("dive0*"))
     old = parquet.read_table(part)
     told = json.loads(old.schema.metadata[b"dvl_calib"]) | {"schema": 0, "extrinsics": {}}
     parquet.write_table(old.replace_schema_metadata({"dvl_calib": json.dumps(told)}), part)
-    result = dc.fleet(dives, out, jobs=1)
+    result = dc.fleet(dives, copied, jobs=1)
     assert (result.calibrated, result.unchanged) == (1, 4)
 
 
@@ -281,10 +285,8 @@ def test_pages_of_a_part_have_checksums_for_other_readers(made):
         parquet.read_table(pa.BufferReader(bytes(flipped)), page_checksum_verification=True)
 
 
-def test_a_damaged_or_foreign_part_is_set_aside_and_its_recording_done_again(made, dives, tmp_path, capsys):
-    out = tmp_path / "out"
-    shutil.copytree(made[1], out)
-    rows = out / "rows"
+def test_a_damaged_or_foreign_part_is_set_aside_and_its_recording_done_again(made, copied, dives):
+    out, rows = copied, copied / "rows"
     before, expected = contents(out), made[0].recordings
     names = {name[:5]: name for name in before}
     flipped = bytearray(before[names["dive0"]])
@@ -311,12 +313,11 @@ def test_a_damaged_or_foreign_part_is_set_aside_and_its_recording_done_again(mad
     assert (again.calibrated, again.notes) == (0, ())
 
 
-def test_what_cannot_be_set_aside_is_said_in_one_line(made, dives, tmp_path, capsys):
-    out = tmp_path / "out"
-    shutil.copytree(made[1], out)
-    (out / "rows" / "bad.parquet").write_text("no part")
-    (out / "set_aside").write_text("a file")
-    assert "bad.parquet" in (said := fail(capsys, "fleet", dives, "--out", out, "--jobs", "1")) and "remove it" in said
+def test_what_cannot_be_set_aside_is_said_in_one_line(copied, dives, capsys):
+    (copied / "rows" / "bad.parquet").write_text("no part")
+    (copied / "set_aside").write_text("a file")
+    said = fail(capsys, "fleet", dives, "--out", copied, "--jobs", "1")
+    assert "bad.parquet" in said and "remove it" in said
 
 
 def test_the_same_data_in_two_places_is_used_once(dives, tmp_path):
@@ -352,9 +353,8 @@ def test_an_object_store_gives_what_its_files_give(made, dives, tmp_path, capsys
     assert "memory:///bucket/dives/auv2/no.mcap: " in "".join(one.error.dropna())
 
 
-def test_the_command_prints_the_answer_and_who_needs_a_person(made, dives, tmp_path, capsys):
-    shutil.copytree(made[1], tmp_path / "out")
-    said, _ = succeed(capsys, "fleet", dives, "--out", tmp_path / "out", "--jobs", "1")
+def test_the_command_prints_the_answer_and_who_needs_a_person(copied, dives, capsys):
+    said, _ = succeed(capsys, "fleet", dives, "--out", copied, "--jobs", "1")
     assert said.startswith("not compared") or said.startswith("moved")
     assert "1 recording of 5 needs a person" in said and "no.mcap" in said
     assert said.count("\nauv1: ") == said.count("\nauv2: ") == 1  # one line per vehicle

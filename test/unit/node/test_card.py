@@ -8,12 +8,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from runs import MatchedRun, calibrate, make_samples
+from runs import MatchedRun, calibrate, make_samples, without
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.filters.observability import PredictedDrift, predicted_drift
+from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample, VelocityFrame
+from dvl_calib_ros.node import operator_card
 from dvl_calib_ros.node.operator_card import (
     LEAST_LOOKS,
     REPLANNED_EVERY_S,
@@ -54,12 +56,7 @@ def test_before_the_first_sample_nothing_is_known_and_all_is_said_so():
 
 
 def test_in_a_dive_the_card_asks_for_the_reference():
-    start_ns = make_samples(RUN)[0].stamp_ns
-    dive = [
-        each
-        for each in make_samples(RUN)
-        if not isinstance(each, ReferenceSample) or each.stamp_ns < start_ns + 90_000_000_000
-    ]
+    dive = without(make_samples(RUN), ReferenceSample, lambda at: at >= 90.0)
     said = values(Card(0.0), calibrate(dive, Parameters(target_drift=0.5)), counts(600), 1.0)
     assert said["next"] == "surface: full learns only with the reference"
 
@@ -89,17 +86,12 @@ def test_the_card_has_the_estimate_its_worth_and_the_heading():
 
 
 def predicted_drift_of(calibrator, estimate):
-    from dvl_calib_ros.calibration.models import MODELS
-
     return predicted_drift(MODELS[estimate.model], estimate.velocity_covariance, calibrator.parameters)
 
 
 def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
-    calls = []
-    from dvl_calib_ros.node import operator_card as module
-
-    real = module.outlook
-    monkeypatch.setattr(module, "outlook", lambda *given: calls.append(1) or real(*given))
+    calls, real = [], operator_card.outlook
+    monkeypatch.setattr(operator_card, "outlook", lambda *given: calls.append(1) or real(*given))
     card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="full"))
     for second in range(11):
         values(card, calibrator, counts(second), float(second))

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.errors import InputError
@@ -94,17 +91,6 @@ def test_the_forward_model_means_by_an_effect_what_the_generator_means(name, tmp
     assert max(abs(sizes[f"{name}.{each}"][0]) / sizes[f"{name}.{each}"][1] for each in typical) > 2.5
 
 
-def test_peers_share_no_code_with_the_diagnosis():
-    code = (
-        "import sys\n"
-        "from validation.peers import answers, bic, correlation, evidence, forward, residual, search, sparse\n"
-        "names = ('effects', 'simulation', 'diagnosis')\n"
-        "print([m for m in sys.modules if m.startswith(tuple(f'dvl_calib_ros.{n}' for n in names))])"
-    )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert shown.stdout.strip() == "[]"
-
-
 # ------------------------------------------------------------------ side by side
 
 
@@ -138,10 +124,7 @@ def test_who_is_asked_beside_is_asked_of_the_same_bags_and_scored_with_the_same_
     both = sides(unseal(trial.sealed), answers)
     assert [side.name for side in both] == ["diagnose", "other"]
     right = [{case.truth.category: is_right(case) for case in side.cases.values()} for side in both]
-    assert right == [
-        {Category.NULL: False, Category.SINGLE: True},
-        {Category.NULL: True, Category.SINGLE: False},
-    ]
+    assert right == [{Category.NULL: False, Category.SINGLE: True}, {Category.NULL: True, Category.SINGLE: False}]
     # what the effect leaves if it is not said is an error; if it is, at a wrong size, it is another
     single = [next(c for c in side.cases.values() if not c.is_null) for side in both]
     assert single[1].left_mps > 0.0

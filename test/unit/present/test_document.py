@@ -29,9 +29,7 @@ MADE = Document(
     answer=Answer("off", Severity.MARGINAL, ["The [bold]first[/]\x07.", "The second."]),
     warnings=["a <warning>"],
     sections=[
-        Section(
-            "Both", [Sentence("Said to both.", soft=True), Table(("", "n"), [("row", Cell("1.5", "bad", "beside"))])]
-        ),
+        Section("Both", [Sentence("Said to both.", soft=True), TABLE]),
         Section("Page", [Sentence("For the page.")], Where.PAGE),
         Section("Terminal", [Sentence("For the terminal.")], Where.TERMINAL),
         Section("Empty", []),
@@ -120,9 +118,8 @@ def test_numbers_have_no_minus_before_zero_and_a_dash_where_there_is_none(value,
 def test_a_table_is_a_row_for_each_object_by_what_its_columns_hold_of_it():
     made = table_by({"n": str, "square": lambda n: Cell(str(n * n), "text")}, [2, 3], ("note",))
     assert made.rows == [["2", Cell("4", "text")], ["3", Cell("9", "text")]]
-    assert made.head == ["n", Cell("square", "text")] and made.notes == (
-        "note",
-    )  # a text's heading is aligned as it is
+    assert made.head == ["n", Cell("square", "text")]  # a text's heading is aligned as it is
+    assert made.notes == ("note",)
 
 
 def test_a_topic_is_broken_between_its_parts_only():

@@ -10,24 +10,28 @@ import re
 import sys
 import zlib
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from command_line import fail, in_fresh_process, succeed
 from io_fixtures import run, steady_run, write_bag
 from report_fixtures import FEW, Page, assert_described, drawn, evaluation, recorded, replay_page
+from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.bag_replay.replay import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned, replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
-from dvl_calib_ros.calibration.results.mounting_quantities import quantities
+from dvl_calib_ros.calibration.results.mounting_quantities import not_shown, quantities
+from dvl_calib_ros.calibration.results.results import Result
 from dvl_calib_ros.files.urdf import numbers
 from dvl_calib_ros.present.figure_style import MODEL_STYLES, MapTrack, TimeAxis, explorable, new_figure
 from dvl_calib_ros.present.page import plain, write_report
 from dvl_calib_ros.present.replay import replayed as document_of
-from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, held_out_errors
+from dvl_calib_ros.present.replay_figures import ModelLine, _hull, estimate_over_time, held_out_errors
 from dvl_calib_ros.verdict.kinds import Severity
 
 SECOND = 1_000_000_000
@@ -346,15 +350,6 @@ def test_replay_writes_a_report_and_keeps_the_old_one(tmp_path, monkeypatch, cap
     assert shown == {"M7", "full"}  # what was asked for, and the selected one
 
 
-def test_a_report_that_cannot_be_written_is_refused_before_the_replay(tmp_path, capsys):
-    bag = write_bag(tmp_path / "bag", run())
-    assert "does not exist" in fail(capsys, "replay", bag, "--report", tmp_path / "none" / "report.html")
-    assert "is a folder" in fail(capsys, "replay", bag, "--report", tmp_path)
-    same = tmp_path / "same"
-    message = fail(capsys, "replay", bag, "--report", same, "--json", same)
-    assert "--report" in message and "--json" in message and not same.exists()
-
-
 def test_without_the_plot_library_the_message_says_what_to_install(tmp_path, capsys, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("dvl_calib_ros.present")]:
         monkeypatch.delitem(sys.modules, name)
@@ -401,3 +396,45 @@ def test_an_evaluation_without_studies_has_no_empty_sections(tmp_path):
     text = Page(path).text
     for section in ("Can the uncertainty", "each run", "Held-out"):
         assert section not in text
+
+
+@pytest.mark.parametrize("place", [(0.8, 0.0, -0.35), (0.0, 0.0, 0.0)])
+def test_no_letter_of_an_axis_of_the_dvl_stands_on_the_title_of_an_axis_of_the_figure(place):
+    nominal, found = (rotation_from_rpy(np.radians([roll, 0.0, 45.0])) for roll in (180.0, 178.0))
+    figure = _hull((0, 2, "up"), nominal, found, place, False)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    letters = [each for each in axes.texts if each.get_text() in ("x", "y", "z")]
+    assert letters
+    for each in letters:
+        box = each.get_window_extent()
+        assert axes.bbox.y0 <= box.y0 and box.y1 <= axes.bbox.y1
+
+
+@cache
+def straight(yaw: int) -> Result:
+    """`full` on a straight leg, whose vehicle does not roll, with a DVL that is mounted with this yaw (degrees)."""
+    rpy = (0.0, 0.0, float(np.radians(yaw)))
+    run = MatchedRun("straight", 60.0, dvl_std=0.01, gnss_std=0.01, mounting_rpy=rpy)
+    result = calibrate(make_samples(run), Parameters(mounting_rpy=rpy), models=("full",)).result()
+    return replace(result, selected="full")
+
+
+@pytest.mark.parametrize("yaw", [0, 30, 45, 90, 180])
+def test_an_axis_that_is_not_shown_is_the_vehicles_where_the_angle_of_that_name_is_shown(yaw):
+    shown = {each.name: each.shown for each in quantities(straight(yaw))}
+    named = " and ".join(not_shown(straight(yaw)).values()).split(" and ")
+    assert ("roll" in named, "the vehicle's roll axis" in named) == (not shown["roll"], shown["roll"])
+    assert "pitch" not in named  # the vehicle's, which a straight leg shows
+
+
+def test_of_a_dvl_mounted_across_it_is_the_pitch_that_a_straight_leg_does_not_show():
+    shown = {each.name: each.shown for each in quantities(straight(90))}
+    assert shown["roll"] and not shown["pitch"]
+    assert not {each.name: each.shown for each in quantities(straight(0))}["roll"]
+
+
+def test_a_scale_across_is_not_asked_for():
+    missing = {entry.axis for entry in straight(0).estimate.observability if entry.missing}
+    named = " and ".join(not_shown(straight(0)).values()).split(" and ")
+    assert "scale across" in missing and "scale across" not in named and "roll" in named

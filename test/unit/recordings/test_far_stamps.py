@@ -148,18 +148,12 @@ def test_one_log_time_does_not_stretch_a_recording(tmp_path, topic, off, storage
         assert look.rate_hz == pytest.approx(expected, rel=0.03), name
 
 
-def test_a_pause_of_hours_in_which_stamps_go_on_is_none_of_wrong_log_times(tmp_path):
+@pytest.mark.parametrize("off", [{}, {40: DAY}], ids=["none", "one"])
+def test_a_log_time_beyond_a_pause_of_hours_is_set_aside_and_not_the_pause(tmp_path, off):
     pause_ns = 5 * 3600 * S
-    recording, messages = logged(tmp_path, "dvl/twist", {}, "mcap", pause_ns)
+    recording, messages = logged(tmp_path, "dvl/twist", off, "mcap", pause_ns)
     assert recording.span_ns == (messages[0][1], messages[-1][1] + pause_ns)
-    assert not recording.notes
-
-
-def test_a_log_time_beyond_a_pause_of_hours_is_set_aside(tmp_path):
-    pause_ns = 5 * 3600 * S
-    recording, messages = logged(tmp_path, "dvl/twist", {40: DAY}, "mcap", pause_ns)
-    assert recording.span_ns == (messages[0][1], messages[-1][1] + pause_ns)
-    assert len(recording.notes) == 1
+    assert len(recording.notes) == len(off)
 
 
 def test_stamps_that_are_off_while_log_times_go_on_are_no_wrong_log_times():

@@ -46,16 +46,14 @@ def typical(name: str) -> Injection:
 
 def followed(scenario: Scenario, every: int = 1) -> list:
     """What comes of handing on each so-many-th sample of the motion; and of a little more, for what is late."""
-    motion, _ = motion_of(replace(scenario, seconds=scenario.seconds))
-    follower, out = Follower(scenario), []
-    for i in range(0, len(motion.time), every):
-        out += follower.add(
-            MotionSample(
-                float(motion.time[i]), motion.velocity_body[i], motion.rotation_enu_from_body[i],
-                motion.angular_velocity[i],
-            )
-        )  # fmt: skip
-    return out
+    follower = Follower(scenario)
+    return [sample for moved in motion_samples(scenario)[::every] for sample in follower.add(moved)]
+
+
+def motion_samples(scenario: Scenario) -> list[MotionSample]:
+    m, _ = motion_of(scenario)
+    columns = zip(m.time.tolist(), m.velocity_body, m.rotation_enu_from_body, m.angular_velocity, strict=True)
+    return [MotionSample(*each) for each in columns]
 
 
 def by_kind(samples) -> dict:
@@ -91,15 +89,10 @@ def test_following_a_motion_gives_what_simulating_all_of_it_gives(name):
 
 def test_samples_come_in_order_of_stamps_and_not_before_the_motion_has_reached_them():
     scenario = with_effects("dvl_time_offset:seconds=0.7", "reference_time_offset:seconds=-0.3", "lever_arm:x_m=1")
-    motion, _ = motion_of(scenario)
-    follower = Follower(scenario)
-    stamps = []
-    for i, time in enumerate(motion.time[:1000]):
-        new = follower.add(
-            MotionSample(float(time), motion.velocity_body[i], motion.rotation_enu_from_body[i], np.zeros(3))
-        )
-        dvl = [sample.stamp_ns for sample in new if isinstance(sample, DvlSample)]
-        assert all(stamp <= 1_760_000_000_000_000_000 + round(time * 1e9) for stamp in dvl)
+    follower, stamps = Follower(scenario), []
+    for moved in motion_samples(scenario)[:1000]:
+        dvl = [sample.stamp_ns for sample in follower.add(moved) if isinstance(sample, DvlSample)]
+        assert all(stamp <= 1_760_000_000_000_000_000 + round(moved.time * 1e9) for stamp in dvl)
         stamps += dvl
     assert stamps == sorted(stamps) and len(stamps) > 40
 
@@ -112,15 +105,9 @@ def test_an_odometry_of_20_hz_is_enough_for_a_slow_motion():
 
 
 def test_across_a_gap_in_the_motion_nothing_is_measured():
-    motion, _ = motion_of(SCENARIO)
     follower, out = Follower(SCENARIO), []
-    for i, time in enumerate(motion.time):
-        if not 5.0 < time < 10.0:
-            out += follower.add(
-                MotionSample(
-                    float(time), motion.velocity_body[i], motion.rotation_enu_from_body[i], motion.angular_velocity[i]
-                )
-            )
+    for moved in motion_samples(SCENARIO):
+        out += [] if 5.0 < moved.time < 10.0 else follower.add(moved)
     times = np.array([1e-9 * (s.stamp_ns - 1_760_000_000_000_000_000) for s in by_kind(out)["DvlSample"]])
     assert not ((times > 5.01) & (times < 9.99)).any() and (times > 10.0).sum() > 25
 

@@ -337,10 +337,7 @@ def test_the_truth_is_attached_on_request_and_changes_nothing_else(capsys, tmp_p
     truth = json.loads(attachments(tmp_path / "with")["truth.json"])
     assert truth["effects"] == [
         {"name": "lever_arm", "parameters": {"x_m": 0.3, "y_m": 0.0, "z_m": 0.0}},
-        {
-            "name": "water_lock",
-            "parameters": {"east_mps": 0.1, "north_mps": 0.0, "from_s": 4.0, "to_s": None},
-        },
+        {"name": "water_lock", "parameters": {"east_mps": 0.1, "north_mps": 0.0, "from_s": 4.0, "to_s": None}},
     ]
     assert truth["seed"] == 3 and truth["trajectory"] == "box" and truth["errors"]["scale"] == [0.005] * 3
     motion = make_motion("box", 10.0, 10.0).velocity_body

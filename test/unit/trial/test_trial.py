@@ -89,10 +89,15 @@ def test_a_case_is_the_same_whenever_it_is_recorded_and_another_with_another_see
     assert messages(alone.bags[0]) != messages(other.bags[0])
 
 
-def test_the_generator_shares_no_code_with_what_it_tests():
+PEERS = "answers, bic, correlation, evidence, forward, residual, search, sparse"
+
+
+@pytest.mark.parametrize(
+    "imports", ["from validation.trial import generator, run, tables", f"from validation.peers import {PEERS}"]
+)
+def test_generator_and_peers_share_no_code_with_the_diagnosis(imports):
     code = (
-        "import sys\n"
-        "import validation.trial.generator, validation.trial.run, validation.trial.tables\n"
+        f"import sys\n{imports}\n"
         "names = ('effects', 'simulation', 'diagnosis')\n"
         "print([m for m in sys.modules if m.startswith(tuple(f'dvl_calib_ros.{n}' for n in names))])"
     )
@@ -174,13 +179,7 @@ def test_recorded_motion_is_the_recording_turned_into_forward_left_up(snapir):
 # ------------------------------------------------------------------ strength
 
 
-@pytest.mark.parametrize(
-    ("name", "rates"),
-    [
-        ("lever_arm", (4.0, 4.0)),
-        ("heading_error", (2.0, 8.0)),
-    ],
-)
+@pytest.mark.parametrize(("name", "rates"), [("lever_arm", (4.0, 4.0)), ("heading_error", (2.0, 8.0))])
 def test_q_is_the_norm_of_the_trace_outside_of_the_calibration_over_the_noise(name, rates, monkeypatch):
     """Computed again from the samples of two bags without noise, one with the fault and one without."""
     case = Case(Category.SINGLE, "box", name, 12.0)

@@ -60,6 +60,11 @@ def bag(path: Path, effects: tuple[str, ...] = (), **fields) -> Path:
     return path
 
 
+def simulator(path: Path, beam_std: float, effects: tuple[str, ...] = (), **fields) -> Path:
+    """A log of one whose reference is the truth."""
+    return bag(path, effects, gnss_rate=10.0, gnss_std=0.0, errors=DvlErrors(beam_std=beam_std), **fields)
+
+
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory) -> dict[str, Path]:
     """A vehicle with a lever arm and misalignment, and a simulator without, its reference being the truth."""
@@ -67,11 +72,8 @@ def bags(tmp_path_factory) -> dict[str, Path]:
     tilted = DvlErrors((0.01, -0.01, 0.03), (0.005,) * 3, (0.0,) * 4, 0.005)
     return {
         "vehicle": bag(folder / "sea", ("lever_arm:x_m=0.8,y_m=-0.3",), errors=tilted, seed=1),
-        "simulator": bag(
-            folder / "sim", trajectory="lawnmower", gnss_rate=10.0, gnss_std=0.0, seed=2,
-            errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.01),
-        ),
-    }  # fmt: skip
+        "simulator": simulator(folder / "sim", 0.01, trajectory="lawnmower", seed=2),
+    }
 
 
 @pytest.fixture(scope="module")
@@ -98,10 +100,7 @@ def test_the_effect_that_the_simulator_lacks_is_named_with_its_size_on_both_side
     assert arm.simulator["x_m"][1] < 0.0 < arm.simulator["x_m"][2]
     assert arm.p < 0.01 and arm.lies is not None and "lever_arm" in compared.sentence
     assert [each.code for each in compared.reasons][:2] == ["SIMULATOR_LACKS", "SIMULATOR_PUT_RIGHT"]
-
-
-@pytest.mark.slow
-def test_a_misalignment_is_no_difference_of_effects_since_calibration_takes_it_in(compared):
+    # a misalignment is none, since calibration takes it in
     assert [each.name for each in compared.effects if each.status.is_claim] == ["lever_arm"]
 
 
@@ -148,11 +147,8 @@ def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys
 
 @pytest.mark.slow
 def test_what_both_have_alike_is_no_claim_and_what_only_the_simulator_has_is_said_so(vehicle, tmp_path):
-    arm = "lever_arm:x_m=0.8,y_m=-0.3"
-    made = bag(
-        tmp_path / "sim", (arm, "velocity_bias:x_mps=0.05"), gnss_rate=10.0, gnss_std=0.0, seed=3,
-        errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.005),
-    )  # fmt: skip
+    effects = ("lever_arm:x_m=0.8,y_m=-0.3", "velocity_bias:x_mps=0.05")
+    made = simulator(tmp_path / "sim", 0.005, effects, seed=3)
     found = {each.name: each.status for each in compare_logs(vehicle, read_log(source(made))).effects}
     assert found["lever_arm"] is ComparisonStatus.ALIKE
     assert found["velocity_bias"] is ComparisonStatus.ONLY_SIMULATOR
@@ -160,11 +156,7 @@ def test_what_both_have_alike_is_no_claim_and_what_only_the_simulator_has_is_sai
 
 @pytest.mark.slow
 def test_a_simulator_whose_dvl_is_its_truth_is_told_so_and_lacks_no_less(vehicle, tmp_path):
-    made = bag(
-        tmp_path / "sim", trajectory="lawnmower", gnss_rate=10.0, gnss_std=0.0,
-        errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.0),
-    )  # fmt: skip
-    found = compare_logs(vehicle, read_log(source(made)))
+    found = compare_logs(vehicle, read_log(source(simulator(tmp_path / "sim", 0.0, trajectory="lawnmower"))))
     leak = next(each for each in found.noise if each.name == "truth_leaks")
     assert leak.status is ComparisonStatus.ONLY_SIMULATOR and "without any noise" in leak.note
     assert [each.name for each in found.effects if each.status.is_claim] == ["lever_arm"]
@@ -172,9 +164,7 @@ def test_a_simulator_whose_dvl_is_its_truth_is_told_so_and_lacks_no_less(vehicle
 
 @pytest.mark.slow
 def test_a_loud_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(vehicle, tmp_path):
-    loud = DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.5)
-    made = bag(tmp_path / "sim", trajectory="straight", gnss_rate=10.0, gnss_std=0.0, errors=loud)
-    found = compare_logs(vehicle, read_log(source(made)))
+    found = compare_logs(vehicle, read_log(source(simulator(tmp_path / "sim", 0.5, trajectory="straight"))))
     arm = next(each for each in found.effects if each.name == "lever_arm")
     assert arm.status is ComparisonStatus.CANNOT_TELL and "with the simulator" in arm.needs
 
@@ -200,13 +190,12 @@ LEAP = "time_offset_jump"
 def leaps(tmp_path_factory) -> dict[str, Log]:
     """Of a clock that never leaps, of two that leap once, in a vehicle and a simulator, and of one that does twice."""
     folder = tmp_path_factory.mktemp("leaps")
-    plain = {"errors": DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.005)}
-    made = plain | {"gnss_rate": 10.0, "gnss_std": 0.0}
+    plain = {"errors": DvlErrors(beam_std=0.005)}
     once = f"{LEAP}:seconds=0.6,at_s=130"
     bags = {
-        "never": bag(folder / "never", seed=2, **made),
+        "never": simulator(folder / "never", 0.005, seed=2),
         "once": bag(folder / "once", (once,), seed=1, **plain),
-        "made_once": bag(folder / "made_once", (once,), seed=4, **made),
+        "made_once": simulator(folder / "made_once", 0.005, (once,), seed=4),
         "twice": bag(
             folder / "twice", (f"{LEAP}:seconds=0.6,at_s=60,again_seconds=0.5,again_at_s=140",), seed=3, **plain
         ),
@@ -528,7 +517,7 @@ def test_noise_alone_makes_the_error_of_a_vehicle_without_a_gap_white_or_slow(tm
 @pytest.mark.slow
 def test_noise_that_a_lag_makes_louder_is_not_counted_twice(tmp_path):
     """Taking a lag off makes the reference's noise louder: less that of an ideal DVL, it was in what is made twice."""
-    noisy = DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.03)
+    noisy = DvlErrors(beam_std=0.03)
     lagging = bag(tmp_path / "sea", ("reference_lag:time_constant_s=1.2",), gnss_std=0.03, seed=1, errors=noisy)
     vehicle = read_log(source(lagging))
     assert vehicle.selection is not None
