@@ -11,7 +11,7 @@ from ..diagnosis.answer.results import Diagnosis
 from ..disk.text_files import write_json
 from ..errors import InputError, needing_page
 from ..examination.examine import Examination
-from .arguments import Bags, StrPath, as_path, as_paths, storage_and_compression
+from .analyse import Bags, StrPath, as_path, as_paths, storage_and_compression
 from .calibrated import Calibration
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from ..calibration.streams.interpolation import ImuColumns
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
-from ..recordings.topic_preview import Preview, Survey
+from ..recordings.topic_messages import Preview, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason
 

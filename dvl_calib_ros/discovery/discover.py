@@ -32,7 +32,7 @@ from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recording import Recording, open_recording
-from ..recordings.topic_preview import Preview, Survey
+from ..recordings.topic_messages import Preview, Survey
 from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice

@@ -12,7 +12,7 @@ from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.clock_domains import limit_s
 from ..calibration.registration.frame_hypotheses import Agreement
 from ..recordings.recording import Recording
-from ..recordings.topic_preview import Preview
+from ..recordings.topic_messages import Preview
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import FoundClocks, find_clocks

@@ -40,7 +40,7 @@ from ..calibration.streams.imu_frame import ENU_FROM
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import DECLARED_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.topic_preview import Preview
+from ..recordings.topic_messages import Preview
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import imu_columns_of
 from .discovery import as_option

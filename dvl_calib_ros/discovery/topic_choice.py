@@ -13,7 +13,7 @@ from ..recordings.topics import ORIENTATION, spelled
 from ..verdict.reasons import Reason, finding
 
 if TYPE_CHECKING:
-    from ..recordings.topic_preview import Preview, Survey
+    from ..recordings.topic_messages import Preview, Survey
 
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
 # Satellites first, then other navigation systems. A simulator's truth is equivalent to either.

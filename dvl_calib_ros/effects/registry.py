@@ -13,13 +13,13 @@ from itertools import chain, groupby
 from typing import Generic, TypeVar
 
 from ..errors import InputError
-from . import environment, kinematic, noise, sensor, timing
+from . import environment, noise, sensor, timing
 from .base import ActsOn, AnyEffect, ClockEffect, Effect, MountingEffect, NoiseEffect
 
 ENTRY_POINTS = "dvl_calib_ros.effects"
 
 OWN: tuple[type[AnyEffect], ...] = (
-    kinematic.LeverArm,
+    sensor.LeverArm,
     timing.DvlTimeOffset,
     timing.ReferenceTimeOffset,
     timing.AttitudeTimeOffset,
@@ -34,8 +34,8 @@ OWN: tuple[type[AnyEffect], ...] = (
     sensor.AxisNonorthogonality,
     environment.HeadingError,
     environment.WaterLock,
-    kinematic.Sideslip,
-    kinematic.TiltCoupling,
+    sensor.Sideslip,
+    sensor.TiltCoupling,
     sensor.MountingMoved,
     sensor.SoundSpeedMoved,
     noise.Outliers,

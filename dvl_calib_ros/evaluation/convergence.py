@@ -15,9 +15,8 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from . import protocol
 from .estimation import SensorData, estimate
-from .metrics import BASELINES
 from .protocol import Trajectory
-from .results import ConvergenceCurve, Failure, mean_of_known
+from .results import BASELINES, ConvergenceCurve, Failure, mean_of_known
 
 TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
 # noise of the reference, m/s per axis: the procedure's, and a good receiver's

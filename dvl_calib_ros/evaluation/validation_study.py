@@ -28,9 +28,22 @@ from ..version import __version__
 from . import protocol
 from .convergence import REFERENCE_STD, TIMES_S, curve_keys, curves, squared_errors
 from .estimation import SensorData, estimate, streams_of, true_prior
-from .metrics import BASELINES, RunMoments, coverage, heading_spread, vrmse
 from .protocol import SCALES_PERCENT, Trajectory, load_folder, own_trajectories
-from .results import CalibrationRun, CalibrationSet, Coverage, EachStudy, Evaluation, Failure, HeldOut, mean_of_known
+from .results import (
+    BASELINES,
+    CalibrationRun,
+    CalibrationSet,
+    Coverage,
+    EachStudy,
+    Evaluation,
+    Failure,
+    HeldOut,
+    RunMoments,
+    coverage,
+    heading_spread,
+    mean_of_known,
+    vrmse,
+)
 
 # One noise seed of the published procedure and of the studies around it.
 

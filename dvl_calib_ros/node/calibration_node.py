@@ -53,18 +53,26 @@ from ..recordings.topics import Topics
 from ..standard_streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
-from .live_checks import GravitySeen, LateClocks, Pauses, steady_s
+from .diagnostics import (
+    RECENT_S,
+    GravitySeen,
+    LateClocks,
+    Pauses,
+    RecentCounts,
+    Silence,
+    diagnose,
+    input_problems,
+    output_problems,
+    steady_s,
+    twin_problems,
+)
 from .live_discovery import Discovering
 from .message_queue import Arrived, in_order_of_arrival, take
 from .message_types import empty_twist, fill_errors, set_stamp, velocity_class
 from .operator_card import Card
-from .ros_parameters import declare_parameters
-from .services import LATCHED, AnsweringNode
+from .services import LATCHED, AnsweringNode, declare_parameters
 from .status import status_name
-from .topic_graph import input_problems, output_problems, twin_problems
-from .transforms import MountingOutput, Transforms
-from .water_topics import WaterHeard
+from .transforms import MountingOutput, Transforms, WaterHeard
 
 # messages that wait in the middleware while Python is busy: 5 s at 1 kHz
 QUEUE = 5000

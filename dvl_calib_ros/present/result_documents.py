@@ -15,11 +15,10 @@ from ..fleet_catalogue.update import Fleet
 from ..unpaired.results import UnpairedComparison, unpaired_document
 from ..unpaired.simulator_rounds import ClosedGap, closed_gap_document
 from .comparison import comparison, fleet
-from .diagnosis import diagnosis
+from .diagnosis import diagnosis, unpaired
 from .document import Document
 from .evaluation import cross_check, evaluation
 from .examination import examination
-from .unpaired import unpaired
 
 DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
     ClosedGap: unpaired,

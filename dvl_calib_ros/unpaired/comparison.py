@@ -25,7 +25,19 @@ from ..diagnosis.search.effect_selection import EffectSelection
 from ..effects.base import EffectInput
 from ..effects.registry import EFFECTS
 from ..verdict.reasons import Reason, finding
-from .both_sides import Log, RecordedSide, read_log
+from .both_sides import (
+    BLOCK,
+    FEWEST_BLOCKS,
+    OUTLIER,
+    Candidate,
+    Log,
+    RecordedSide,
+    compare_streams,
+    mean_of,
+    read_log,
+    shares_of,
+    welch,
+)
 from .effect_comparison import (
     Size,
     common_names,
@@ -41,7 +53,6 @@ from .effect_comparison import (
 )
 from .gap_ladder import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, SimulatorVerdict, UnpairedComparison
-from .stream_comparison import BLOCK, FEWEST_BLOCKS, OUTLIER, Candidate, compare_streams, mean_of, shares_of, welch
 
 # Comparison of both sides' noise: level per axis, growth with motion, tails, colour.
 #
