@@ -29,7 +29,11 @@ if TYPE_CHECKING:
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """Add --params and -p, as in ROS 2, and --profile, which stores them."""
-    add_profile_option(parser)
+    parser.add_argument(
+        "--profile", metavar="NAME",
+        help="profile of topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file, or none for no profile; "
+        f"default: {IN_FOLDER} of this folder",
+    )  # fmt: skip
     parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
     override = parser.add_argument(
         "-p", dest="overrides", action="append", default=[], metavar="NAME:=VALUE", help="set one parameter; repeatable"
@@ -345,15 +349,6 @@ def result_files(arguments: argparse.Namespace, result: Any) -> list[tuple[Path 
 IN_FOLDER = Path(".dvl-calib.yaml")
 # Options that a profile may hold next to `parameters`. None names an output file.
 OPTIONS = ("dvl-topic", "gnss-topic", "imu-topic", "params")
-
-
-def add_profile_option(parser: argparse.ArgumentParser) -> None:
-    """Add --profile."""
-    parser.add_argument(
-        "--profile", metavar="NAME",
-        help="profile of topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file, or none for no profile; "
-        f"default: {IN_FOLDER} of this folder",
-    )  # fmt: skip
 
 
 def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str]:

@@ -92,7 +92,7 @@ def _show_live(out: Any, bag: Path, speed: float) -> None:
     """Play the bag to the node and show its estimates live."""
     from rich.live import Live
 
-    from ..demo.watch import Watcher
+    from ..demo.player import Watcher
 
     watcher = Watcher([bag], _truth())
     out.print(f"[bold]1. Live[/]: node and player are two processes, ROS domain {os.environ['ROS_DOMAIN_ID']}")

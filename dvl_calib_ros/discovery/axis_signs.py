@@ -25,8 +25,7 @@ from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_offsets import imu_columns_of
-from .discovery import as_option, in_time_of
+from .discovery import as_option, imu_columns_of, in_time_of
 from .frame_choice import SAME_ANSWER
 
 # Interval over which the speed ahead changes in a turn, s: longer than waves, shorter than a change of throttle.

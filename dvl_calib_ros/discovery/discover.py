@@ -37,10 +37,19 @@ from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .axis_signs import sign_findings
-from .clock_offsets import compared_motion, difference_of, on_imu_clock
-from .discovery import Discovery, Given, as_option, clocks_of_recording, in_time_of, mounting_guessed
-from .frame_choice import AXES, FrameChoice, FrameChooser, declared_reference
-from .gravity import Gravity, believed_heading
+from .discovery import (
+    Discovery,
+    Given,
+    as_option,
+    clocks_of_recording,
+    compared_motion,
+    difference_of,
+    in_time_of,
+    mounting_guessed,
+    on_imu_clock,
+)
+from .frame_choice import AXES, FrameChooser, declared_reference
+from .gravity import believed_heading, contradictions
 from .transforms import FrameTree, Placed, in_degrees, in_metres
 
 # a smaller rotation in the data is a misalignment to calibrate; a larger one is another mounting
@@ -210,8 +219,11 @@ class _Search:
                 "(-p use_message_covariance:=false)"
             )
         self._lower_min_speed(dvl)
-        if reference is not None:
-            chosen = self._fit(frames, dvl, reference, imu, mounting, placed)
+        if reference is not None and (motion := compared_motion(dvl, reference, imu)) is not None:
+            position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
+            self._readings = Readings(motion, position)
+            is_known = _is_located(placed) and self._known_reference_position(reference) is not None
+            chosen = frames.choose(self._readings, reference, None if mounting is None else mounting.T, is_known)
         imu_choice = frames.imu if chosen is None else chosen.imu
         self._use_base_axes(imu_choice is not None and imu_choice.z_down)
         is_turned = frames.dvl_is_turned(self._is_z_down)
@@ -274,13 +286,8 @@ class _Search:
 
     def _check_gravity(self, imu: Preview) -> None:
         """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
-        gravity, parameters = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
-        if gravity is not None and (
-            found := gravity.contradiction(
-                imu.topic, rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, parameters.is_z_down
-            )
-        ):
-            self._contradictions.append(found)
+        parameters = self._parameters.replace(**self._values)
+        self._contradictions += contradictions(imu.topic, imu.values[:, :4], imu.values[:, 7:], parameters)
 
     def _use_claimed_heading(self, imu: Preview) -> None:
         """Set the heading accuracy that the IMU claims."""
@@ -365,27 +372,6 @@ class _Search:
             return True
         fit = self._chosen  # a reference in the body frame agrees regardless of the IMU
         return fit is not None and not fit.reading.in_body and fit.best_residual < MAX_RESIDUAL
-
-    def _fit(
-        self,
-        frames: FrameChooser,
-        dvl: Preview,
-        reference: Preview,
-        imu: Preview | None,
-        mounting: Array | None,
-        placed: Placed | None,
-    ) -> FrameChoice | None:
-        """Choose the frames under which DVL and reference agree best; None without common motion.
-
-        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
-        """
-        position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
-        motion = compared_motion(dvl, reference, imu)
-        if motion is None:
-            return None
-        self._readings = Readings(motion, position)
-        is_known = _is_located(placed) and self._known_reference_position(reference) is not None
-        return frames.choose(self._readings, reference, None if mounting is None else mounting.T, is_known)
 
     def _use_reading(self, chosen: Agreement, mounting: Array | None, reference: Preview, imu: Preview | None) -> None:
         """Write the frames and mounting of a reading into the parameters.

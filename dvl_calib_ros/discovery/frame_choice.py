@@ -42,8 +42,7 @@ from ..messages.decode import DECLARED_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Preview
 from ..verdict.reasons import Reason, finding
-from .clock_offsets import imu_columns_of
-from .discovery import as_option
+from .discovery import as_option, imu_columns_of
 from .gravity import Gravity
 from .transforms import Placed, in_degrees
 

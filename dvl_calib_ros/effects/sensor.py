@@ -7,7 +7,18 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.numerics.frames import Array, cross
-from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter, MountingEffect, along_axes, vector
+from .base import (
+    HOUR_S,
+    ActsOn,
+    Effect,
+    EffectInput,
+    EffectNeeds,
+    EffectParameter,
+    MountingEffect,
+    along_axes,
+    vector,
+    within,
+)
 
 
 class VelocityBias(Effect):
@@ -36,9 +47,7 @@ class QuadraticScale(Effect):
     remedy = "ask the DVL's maker; drive the survey at the speed that was calibrated"
     manoeuvre = "straight legs at three speeds or more"
     parameters = (
-        EffectParameter(
-            "coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed", said="coefficient"
-        ),
+        within("coefficient_s_per_m", "s/m", 0.005, 0.2, "scale-factor error per m/s of speed", "coefficient"),
     )
     acts_on = ActsOn.DVL
     confounded_with = ("velocity_bias",)
@@ -55,11 +64,7 @@ class ScaleDrift(Effect):
     summary = "the scale-factor error changes along the run, as of sound speed: rate · (t - start) · v"
     remedy = "measure the speed of sound along the run, or give the DVL temperature and salinity"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
-    parameters = (
-        EffectParameter(
-            "rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour", said="rate"
-        ),
-    )
+    parameters = (within("rate_per_hour", "1/h", 0.03, 2.0, "change of the scale-factor error per hour", "rate"),)
     per_recording = True
     acts_on = ActsOn.DVL
     confounded_with = ("misalignment_drift",)
@@ -137,6 +142,9 @@ class SoundSpeedMoved(Effect):
         return values["ratio"] * motion.velocity_body
 
 
+_SHEAR = "half of the difference between 90° and the angle of {} and {}"
+
+
 class AxisNonorthogonality(Effect):
     """Axes that are not orthogonal, for example by wrong beam directions.
 
@@ -148,16 +156,7 @@ class AxisNonorthogonality(Effect):
     remedy = "ask the DVL's maker: its beam directions differ from the specification"
     manoeuvre = "sway and heave in addition to surge: drift across, dive or drive in waves"
     parameters = tuple(
-        EffectParameter(
-            f"{axes}_rad",
-            "rad",
-            0.01,
-            -0.3,
-            0.3,
-            f"half of the difference between 90° and the angle of {axes[0]} and {axes[1]}",
-            said=axes,
-        )
-        for axes in ("xy", "xz", "yz")
+        within(f"{a}{b}_rad", "rad", 0.01, 0.3, _SHEAR.format(a, b), f"{a}{b}") for a, b in ("xy", "xz", "yz")
     )
     acts_on = ActsOn.DVL
     confounded_with = ("sideslip", "lever_arm")
@@ -197,15 +196,7 @@ class Sideslip(Effect):
     )
     manoeuvre = "turns to both sides at two speeds (a lever arm does not grow with speed)"
     parameters = (
-        EffectParameter(
-            "coefficient_s",
-            "s",
-            0.1,
-            -10.0,
-            10.0,
-            "sway per turn rate and speed; negative: outward",
-            said="coefficient",
-        ),
+        within("coefficient_s", "s", 0.1, 10.0, "sway per turn rate and speed; negative: outward", "coefficient"),
     )
     acts_on = ActsOn.MOTION
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
@@ -225,14 +216,10 @@ class TiltCoupling(Effect):
     remedy = "the velocity of DVL or reference is not rotated by the vehicle's roll and pitch: check the driver's frame"
     manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
     parameters = (
-        EffectParameter(
-            "x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)", said="x per pitch"
-        ),
-        EffectParameter("z_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "heave error per pitch", said="z per pitch"),
-        EffectParameter(
-            "y_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "sway error per roll (positive: port side up)", said="y per roll"
-        ),
-        EffectParameter("z_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "heave error per roll", said="z per roll"),
+        within("x_per_pitch", "m/s/rad", 0.5, 20.0, "surge error per pitch (positive: bow down)", "x per pitch"),
+        within("z_per_pitch", "m/s/rad", 0.5, 20.0, "heave error per pitch", "z per pitch"),
+        within("y_per_roll", "m/s/rad", 0.5, 20.0, "sway error per roll (positive: port side up)", "y per roll"),
+        within("z_per_roll", "m/s/rad", 0.5, 20.0, "heave error per roll", "z per roll"),
     )
     acts_on = ActsOn.DVL
     of_velocity = False

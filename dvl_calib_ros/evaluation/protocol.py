@@ -27,7 +27,7 @@ from ..calibration.numerics.frames import FLU_FROM_FRD, Array, attitude_enu_flu_
 from ..errors import InputError
 from ..logs.dvl_log import angular_velocities
 from ..logs.trajectories import read_columns
-from ..simulation.sensors import DvlErrors, equivalent_error_terms, measure_dvl, measure_gnss
+from ..simulation.sensors import DvlErrors, equivalent_error_terms
 from ..simulation.trajectories import make_motion
 from .results import UNCALIBRATED, CalibrationSet
 
@@ -79,16 +79,6 @@ def truth() -> Array:
     """
     pairs = [equivalent_error_terms(errors) for errors in COMBINATIONS]
     return np.array([[*FLU_FROM_FRD @ misalignment, *scale] for misalignment, scale in pairs])
-
-
-def unit_under_test(velocity_flu: Array, errors: DvlErrors, rng: np.random.Generator) -> Array:
-    """Simulate a DVL with these errors (N, 3) m/s from a velocity over ground, both forward-left-up."""
-    return measure_dvl(velocity_flu @ FLU_FROM_FRD, errors, np.eye(3), rng) @ FLU_FROM_FRD
-
-
-def reference(velocity_flu: Array, rng: np.random.Generator, gnss_std: float = GNSS_STD) -> Array:
-    """Simulate GNSS (N, 3) m/s from a velocity over ground, body frame."""
-    return measure_gnss(velocity_flu, gnss_std, rng)
 
 
 def random_stream(sensor: str, seed: int, trajectory: str, combination: int) -> np.random.Generator:

@@ -26,7 +26,6 @@ from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_sc
 from ..calibration.models import MODELS
 from ..calibration.models.base import Needs
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.frames import rotation_from_rpy
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import arrival_offset
@@ -34,7 +33,7 @@ from ..calibration.registration.clock_drift_and_jumps import REPORTED_FROM_S
 from ..calibration.registration.registration import OFFSETS, Registration
 from ..calibration.results.results import Estimate, scale_and_delay
 from ..calibration.streams.aligner import counts_by_use
-from ..discovery.gravity import Gravity
+from ..discovery.gravity import contradictions
 from ..errors import printable
 from ..messages.drivers import TYPES_OF, VelocityType
 from ..verdict.kinds import Severity
@@ -151,14 +150,7 @@ class GravitySeen:
     def problems(self, topic: str, parameters: Parameters) -> list[Reason]:
         """Return the contradictions between gravity and the configured use of this topic."""
         rows = np.array(self._rows, dtype=float).reshape(-1, 7)
-        gravity = Gravity.of(rows[:, :4], rows[:, 4:])
-        body_from_imu = rotation_from_rpy(parameters.imu_rpy)
-        found = (
-            None
-            if gravity is None
-            else gravity.contradiction(topic, body_from_imu, parameters.imu_frame, parameters.is_z_down)
-        )
-        return [] if found is None else [found]
+        return contradictions(topic, rows[:, :4], rows[:, 4:], parameters)
 
 
 class LateClocks:

@@ -34,8 +34,7 @@ from .document import (
 from .numbers import counted, number, with_std
 
 if TYPE_CHECKING:
-    from ..fleet_catalogue.update import Fleet
-    from ..fleet_catalogue.vehicle_history import CompassDeviation, NeedsPerson, VehicleHistory
+    from ..fleet_catalogue.update import CompassDeviation, Fleet, NeedsPerson, VehicleHistory
 
 # with more pairs than these a terminal shows only neighbours in time
 MOST_PAIRS = 10

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from ..calibration.models import MODELS
-from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, Evaluation, HeldOut
+from ..evaluation.validation_study import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from .document import (
     CELL_KINDS,

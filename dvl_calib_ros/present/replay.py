@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bag_replay.replay import Replayed
 from ..calibration.assessment.dead_reckoning import in_words, metres
 from ..calibration.assessment.manoeuvre_planner import drift_left_open
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.frames import Array, rpy_from_rotation
+from ..calibration.numerics.frames import rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.results.mounting_quantities import not_shown, quantities
 from ..calibration.results.results import Estimate, Result, Verification
@@ -399,13 +398,6 @@ SCALES = (
 ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
 
 
-def _error_terms(estimate: Estimate) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return φ (3) and δk (3), their standard deviations, and whether the model estimates them; each (6,)."""
-    terms = MODELS[estimate.model].error_terms_from_state
-    variance = np.diag(terms @ estimate.covariance @ terms.T)
-    return terms @ estimate.state, np.sqrt(variance), np.asarray(terms.any(axis=1))
-
-
 def state_of(model: Model, term: Term) -> int:
     """Return the index of the state of an error term."""
     return int(np.argmax(model.error_terms_from_state[term.row]))
@@ -445,7 +437,9 @@ def estimate_table(result: Result, models: Sequence[str]) -> Table:
 def _cells(estimate: Estimate, terms: Sequence[Term]) -> list[str]:
     """Return error terms with ±1σ; – if the model has none, ? if not observable."""
     model = MODELS[estimate.model]
-    value, std, estimated = _error_terms(estimate)
+    of_state = model.error_terms_from_state
+    value, std = of_state @ estimate.state, np.sqrt(np.diag(of_state @ estimate.covariance @ of_state.T))
+    estimated = np.asarray(of_state.any(axis=1))
     cells = []
     for term in terms:
         if not estimated[term.row]:

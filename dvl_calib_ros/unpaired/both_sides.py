@@ -262,8 +262,17 @@ RATE_SHARE, JITTER_S, LATENCY_S = 0.03, 0.002, 0.01
 
 def compare_streams(vehicle: Log, simulator: Log) -> list[Candidate]:
     """Compare all properties observable on both sides."""
-    functions = (_exact, _outliers, _dropouts, _zeros, _repeats, _rate, _jitter, _latency)
-    found = [function(vehicle, simulator) for function in functions]
+    has_noise = not (vehicle.exact or simulator.exact)  # at a constant velocity the truth repeats itself
+    found = [
+        _exact(vehicle, simulator),
+        _outliers(vehicle, simulator),
+        _events("dropouts", vehicle, simulator, lambda facts: facts.missing + facts.refused),
+        _events("zeros_on_dropout", vehicle, simulator, lambda facts: facts.zero),  # sent as a velocity of zero
+        _events("repeats", vehicle, simulator, lambda facts: facts.repeats) if has_noise else None,
+        _rate(vehicle, simulator),
+        _times("jitter", vehicle, simulator, lambda facts: _usual(facts.steps), np.std, JITTER_S),
+        _times("latency", vehicle, simulator, lambda facts: facts.latency, np.median, LATENCY_S),
+    ]
     return [candidate for candidate in found if candidate is not None]
 
 
@@ -305,27 +314,12 @@ def _exact(vehicle: Log, simulator: Log) -> Candidate | None:
     return Candidate("truth_leaks", "yes", values[0], values[1], p, (leaks[0], leaks[1]), note=f"{who} DVL is {how}")
 
 
-def _dropouts(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Compare the shares of missing and refused messages."""
-    counts = [
-        (sum(f.missing + f.refused for f in log.facts), sum(f.received for f in log.facts))
-        for log in (vehicle, simulator)
-    ]
-    return shares_of("dropouts", counts[0], counts[1])
-
-
-def _zeros(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Compare dropouts sent as a velocity of zero."""
-    counts = [(sum(f.zero for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)]
-    return shares_of("zeros_on_dropout", counts[0], counts[1])
-
-
-def _repeats(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Compare the shares of repeated samples; None for a DVL without noise."""
-    if vehicle.exact or simulator.exact:
-        return None  # at a constant velocity the truth repeats itself
-    counts = [(sum(f.repeats for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)]
-    return shares_of("repeats", counts[0], counts[1])
+def _events(name: str, vehicle: Log, simulator: Log, events: Callable[[StreamFacts], int]) -> Candidate | None:
+    """Compare the shares of messages with an event."""
+    vehicle_counts, simulator_counts = (
+        (sum(map(events, log.facts)), sum(facts.received for facts in log.facts)) for log in (vehicle, simulator)
+    )
+    return shares_of(name, vehicle_counts, simulator_counts)
 
 
 def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -338,40 +332,30 @@ def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
     return Candidate("rate", "Hz", spans[0], spans[1], 0.0 if change > RATE_SHARE else 1.0, matters=change > RATE_SHARE)
 
 
-def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Compare the standard deviation of the steps between stamps, s."""
-
-    def std_of_steps(log: Log) -> Array:
-        return np.concatenate([_blocks(_usual(f.steps), lambda b: np.std(b, axis=1)) for f in log.facts])
-
-    return _compare_times("jitter", std_of_steps(vehicle), std_of_steps(simulator), JITTER_S)
-
-
 def _usual(steps: Array) -> Array:
     """Return the steps between stamps that are no gap."""
     interval = float(np.median(steps)) if len(steps) else 0.0
     return steps[steps < DROPOUT_INTERVALS * interval]
 
 
-def _latency(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Compare the median delay from stamp to log time, s."""
+def _times(
+    name: str,
+    vehicle: Log,
+    simulator: Log,
+    times: Callable[[StreamFacts], Array],
+    statistic: Callable[..., Array],
+    threshold_s: float,
+) -> Candidate | None:
+    """Compare the means over blocks of a statistic of times, s; differences below a threshold do not matter."""
 
-    def latency_of(log: Log) -> Array:
-        return np.concatenate([_blocks(f.latency, lambda b: np.median(b, axis=1)) for f in log.facts])
+    def block_values(log: Log) -> Array:
+        blocks = [values[: len(values) // BLOCK * BLOCK].reshape(-1, BLOCK) for values in map(times, log.facts)]
+        return np.concatenate([statistic(block, axis=1) for block in blocks])
 
-    return _compare_times("latency", latency_of(vehicle), latency_of(simulator), LATENCY_S)
-
-
-def _blocks(values: Array, statistic: Callable[[Array], Array]) -> Array:
-    blocks = values[: len(values) // BLOCK * BLOCK].reshape(-1, BLOCK)
-    return statistic(blocks) if len(blocks) else np.zeros(0)
-
-
-def _compare_times(name: str, vehicle: Array, simulator: Array, threshold_s: float) -> Candidate | None:
-    """Compare the means of block values (B,) s of both sides; differences below a threshold do not matter."""
-    if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
+    of_vehicle, of_simulator = block_values(vehicle), block_values(simulator)
+    if min(len(of_vehicle), len(of_simulator)) < FEWEST_BLOCKS:
         return None
-    is_present = abs(float(vehicle.mean())) > threshold_s, abs(float(simulator.mean())) > threshold_s
-    matters = abs(float(vehicle.mean() - simulator.mean())) > threshold_s
-    p = welch(vehicle, simulator)
-    return Candidate(name, "s", mean_of(vehicle), mean_of(simulator), p, is_present, matters)
+    is_present = abs(float(of_vehicle.mean())) > threshold_s, abs(float(of_simulator.mean())) > threshold_s
+    matters = abs(float(of_vehicle.mean() - of_simulator.mean())) > threshold_s
+    p = welch(of_vehicle, of_simulator)
+    return Candidate(name, "s", mean_of(of_vehicle), mean_of(of_simulator), p, is_present, matters)

@@ -39,19 +39,22 @@ from .both_sides import (
     welch,
 )
 from .effect_comparison import (
+    AS_IT_IS,
+    NOISE,
     Size,
     common_names,
     compared_names,
     fitted,
     is_there,
     location_of,
+    models,
     p_alike,
+    shrink,
     sizes,
     smallest_difference,
     trace_of,
     union,
 )
-from .gap_ladder import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, SimulatorVerdict, UnpairedComparison
 
 # Comparison of both sides' noise: level per axis, growth with motion, tails, colour.
@@ -354,6 +357,7 @@ def other_frame(vehicle: RecordedSide, simulator: RecordedSide) -> tuple[Reason,
 def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
     """Run `compare` for sides that are already read and diagnosed."""
     selections = vehicle.selection, simulator.selection
+    sides = {"vehicle": vehicle, "simulator": simulator}
     if selections[0] is None or selections[1] is None:
         return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
     candidates = [*compare_noise(vehicle, simulator), *compare_streams(vehicle, simulator)]
@@ -380,28 +384,16 @@ def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
         levels={name: (level, levels[1][name]) for name, level in levels[0].items() if name in levels[1]},
         rungs=shrunk.rungs,
         floor_mps=shrunk.floor,
-        not_shown={side: _unobserved(log.diagnosis) for side, log in (("vehicle", vehicle), ("simulator", simulator))},
+        not_shown={side: _unobserved(log.diagnosis) for side, log in sides.items()},
         vehicle=vehicle.diagnosis,
         simulator=simulator.diagnosis,
-        notes=tuple(
-            f"{side}: {note}"
-            for side, log in (("vehicle", vehicle), ("simulator", simulator))
-            for note in log.diagnosis.notes
-        ),
-        series=_series(shrunk, vehicle, simulator),
-    )
-
-
-def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
-    """Return the data of the figures."""
-    return {
-        "shrunk": shrunk,
-        "residuals": {"vehicle": vehicle.residuals, "simulator": simulator.residuals},
-        "intervals": {
-            side: [recording.dvl.interval for recording in log.recordings]
-            for side, log in (("vehicle", vehicle), ("simulator", simulator))
+        notes=tuple(f"{side}: {note}" for side, log in sides.items() for note in log.diagnosis.notes),
+        series={
+            "shrunk": shrunk,
+            "residuals": {side: log.residuals for side, log in sides.items()},
+            "intervals": {side: [one.dvl.interval for one in log.recordings] for side, log in sides.items()},
         },
-    }
+    )
 
 
 class _Compared:
