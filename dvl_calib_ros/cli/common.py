@@ -77,14 +77,17 @@ def opened(bags: Sequence[Path], parameters: Parameters) -> Recording:
         return open_recording(bags, None, parameters, on_progress)
 
 
-def discovered(arguments: argparse.Namespace, recording: Recording, parameters: Parameters) -> Discovery:
-    """Find topics, mounting and frames in a recording; options take precedence. Raises InputError.
+def discovered(
+    arguments: argparse.Namespace, bags: Sequence[Path], parameters: Parameters
+) -> tuple[Recording, Discovery]:
+    """Open recordings and find their topics, mounting and frames; options take precedence. Raises InputError.
 
     parameters: as loaded by `load` from the same options.
     """
     from ..discovery.discover import discover
 
-    return discover(recording, parameters, given(arguments))
+    recording = opened(bags, parameters)
+    return recording, discover(recording, parameters, given(arguments))
 
 
 def given(arguments: argparse.Namespace) -> Given:

@@ -83,8 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         | ({} if sampled is None else {"--samples": sampled}),
     )
     _check_twins(arguments.twin, names)
-    recording = common.opened(arguments.bags, parameters)
-    discovery = common.discovered(arguments, recording, parameters)
+    recording, discovery = common.discovered(arguments, arguments.bags, parameters)
     parameters = discovery.diagnosed
     rejected = rejection(recording, discovery)  # before the messages are forgotten
     with common.progress("diagnosing") as on_progress:
@@ -221,7 +220,6 @@ def _open_side(
     from ..unpaired.both_sides import RecordedSide
 
     side_arguments = argparse.Namespace(**{**vars(arguments), "params": params})
-    recording = common.opened(bags, common.load(side_arguments))
-    discovery = common.discovered(side_arguments, recording, common.load(side_arguments))
+    recording, discovery = common.discovered(side_arguments, bags, common.load(side_arguments))
     parameters = common.load(side_arguments, DEFAULTS).replace(**discovery.values)
     return RecordedSide(recording, parameters, discovery.topics), discovery

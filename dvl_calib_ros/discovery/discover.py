@@ -153,19 +153,12 @@ class _Search:
         given, default = self._given, Topics()
         dvl = self._checked("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._survey, default.dvl, self._where)
         self._notes += topic_choice.other_dvls(self._survey, dvl, difference_of)
-        gnss, imu = default.gnss, default.imu
-        if given.gnss_topic is None:
-            chosen, notes = topic_choice.choose_reference(self._survey, default.gnss, dvl, difference_of)
-            gnss = chosen or default.gnss
+        gnss, imu = self._checked("gnss", given.gnss_topic), self._checked("imu", given.imu_topic)
+        if gnss is None:
+            gnss, notes = topic_choice.choose_reference(self._survey, default.gnss, dvl, difference_of)
             self._notes += notes
-        elif given.gnss_topic != NONE:
-            gnss = self._checked("gnss", given.gnss_topic) or gnss
-        else:
-            gnss = NONE
-        if given.imu_topic is None:
-            imu = topic_choice.choose_imu(self._survey, default.imu, gnss) or default.imu
-        else:
-            imu = NONE if given.imu_topic == NONE else self._checked("imu", given.imu_topic) or imu
+        gnss = gnss or default.gnss
+        imu = imu or topic_choice.choose_imu(self._survey, default.imu, gnss) or default.imu
         if imu.endswith(ORIENTATION) and imu in self._survey.topics:
             self._found.append(
                 f"no IMU gives an attitude; it is the orientation of {imu.removesuffix(ORIENTATION)}, and turn rates "
@@ -174,8 +167,10 @@ class _Search:
         return Topics(dvl, gnss, imu)
 
     def _checked(self, role: str, name: str | None) -> str | None:
-        """Return a named topic if the recording has it with a usable type. Raises InputError."""
-        return None if name is None else topic_choice.checked_topic(role, name, self._survey, self._where)
+        """Return a named topic if the recording has it with a usable type, or NONE. Raises InputError."""
+        if name is None or (name == NONE and role != "dvl"):
+            return name
+        return topic_choice.checked_topic(role, name, self._survey, self._where)
 
     def _describe_topics(self, topics: Topics) -> str:
         """Describe the chosen topics with type, frame and rate, for the first line of the output."""
@@ -255,7 +250,8 @@ class _Search:
         self._set_position(placed, reference)
         if imu is not None:
             self._use_claimed_heading(imu)
-            self._check_gravity(imu)
+            parameters = self._parameters.replace(**self._values)
+            self._contradictions += contradictions(imu.topic, imu.values[:, :4], imu.values[:, 7:], parameters)
 
     def _lower_min_speed(self, dvl: Preview) -> None:
         """Set min_speed of a vehicle that mostly moves more slowly than the default."""
@@ -283,11 +279,6 @@ class _Search:
                 f"{base} is forward-right-down by the IMU's attitude and its transform: mounting and "
                 "lever arm are in these axes (base_axes frd)"
             )
-
-    def _check_gravity(self, imu: Preview) -> None:
-        """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
-        parameters = self._parameters.replace(**self._values)
-        self._contradictions += contradictions(imu.topic, imu.values[:, :4], imu.values[:, 7:], parameters)
 
     def _use_claimed_heading(self, imu: Preview) -> None:
         """Set the heading accuracy that the IMU claims."""

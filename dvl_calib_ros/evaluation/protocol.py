@@ -14,7 +14,7 @@ licence, so users download them, and this project does not include them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import product
 from pathlib import Path
@@ -131,14 +131,9 @@ class Trajectory:
 
     def part(self, start: int, end: int) -> Trajectory:
         """Return the samples start .. end - 1."""
-        rotation, rates = self.rotation_enu_from_body, self.angular_velocity
-        return Trajectory(
-            self.name,
-            self.time[start:end],
-            self.velocity[start:end],
-            None if rotation is None else rotation[start:end],
-            None if rates is None else rates[start:end],
-        )
+        columns = ("time", "velocity", "rotation_enu_from_body", "angular_velocity")
+        given = ((name, getattr(self, name)) for name in columns)
+        return replace(self, **{name: values[start:end] for name, values in given if values is not None})
 
 
 def load_folder(folder: Path, partial: bool = False) -> tuple[dict[str, Trajectory], tuple[str, ...]]:

@@ -276,14 +276,10 @@ class Evaluation(Answering):
 
     def best(self, values: Array) -> dict[str, tuple[str, float]]:
         """Return, "with GNSS" and "without GNSS", the name and value of the model with the smallest of values (C,)."""
-        found = {
-            aiding: [
-                (name, float(value))
-                for name, value in zip(self.columns, values, strict=True)
-                if name in MODELS and MODELS[name].aided == aided and np.isfinite(value)
-            ]
-            for aiding, aided in (("with GNSS", True), ("without GNSS", False))
-        }
+        known = zip(self.columns, map(float, values), strict=True)
+        usable = [(name, value) for name, value in known if name in MODELS and np.isfinite(value)]
+        aidings = (("with GNSS", True), ("without GNSS", False))
+        found = {aiding: [each for each in usable if MODELS[each[0]].aided == aided] for aiding, aided in aidings}
         return {aiding: min(each, key=lambda pair: pair[1]) for aiding, each in found.items() if each}
 
     def of_models(self, values: Array) -> Array:

@@ -87,16 +87,9 @@ def squared_errors(
         states = estimate([*aided, *free], data, parameters.replace(gnss_aided_std=std), ends, failures)
         for name, state in states.items():
             by_key[name, None if name in free else std] = mean_of_known((state.x[..., :3] - truth) ** 2, 1)
-        for name, align in BASELINES.items():
-            try:
-                rotations = [
-                    align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for end in ends
-                ]
-                errors = np.stack([_rotation_errors(each, truth) for each in rotations])
-            except Exception as error:  # only this curve's share of the run is lost
-                failures.append(Failure.of(error, name, run.name))
-                continue
-            by_key[name, std] = (errors**2).mean(axis=1)
+        for name, rotations in _baselines(data, ends, failures).items():
+            if np.isfinite(rotations).all():  # else only this curve's share of the run is lost
+                by_key[name, std] = np.mean([_rotation_errors(each, truth) ** 2 for each in rotations], axis=1)
     missing = np.full((len(TIMES_S), 3), np.nan)
     return np.stack([by_key.get(key, missing) for key in curve_keys(models)])
 
@@ -222,10 +215,10 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     baselines = np.array(
         [
             [
-                float(vrmse(_moments_of_others(moments, each.calibration_run), matrices).mean())
-                for matrices in _baselines(data(each.calibration_run), each.window_s, failures)
+                float(vrmse(_moments_of_others(moments, each.calibration_run), rotations[0]).mean())
+                for rotations in _baselines(stretch, [stretch.run.first(each.window_s)], failures).values()
             ]
-            for each in procedure.sets
+            for each, stretch in ((each, data(each.calibration_run)) for each in procedure.sets)
         ]
     )
     if not procedure.studies:
@@ -266,16 +259,16 @@ def _moments_of_others(moments: Mapping[str, RunMoments], name: str) -> RunMomen
     return RunMoments.stack([each for other, each in moments.items() if other != name])
 
 
-def _baselines(data: SensorData, window_s: float | None, failures: list[Failure]) -> list[Array]:
-    """Return corrections (B, 3, 3) by each baseline; nan if it raises."""
-    end = data.run.first(window_s)
-    found = []
+def _baselines(data: SensorData, ends: Sequence[int], failures: list[Failure]) -> dict[str, Array]:
+    """Return rotations (E, B, 3, 3) by each baseline after the first `ends` samples; nan if it raises."""
+    found: dict[str, Array] = {}
     for name, align in BASELINES.items():
         try:
-            found.append(align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]))
+            parts = ((data.run.time[:n], data.velocity_dvl[:, :n], data.reference[:, :n]) for n in ends)
+            found[name] = np.stack([align(*part) for part in parts])
         except Exception as error:
             failures.append(Failure.of(error, name, data.run.name))
-            found.append(np.full((len(data.velocity_dvl), 3, 3), np.nan))
+            found[name] = np.full((len(ends), len(data.velocity_dvl), 3, 3), np.nan)
     return found
 
 
@@ -568,8 +561,6 @@ def _summary(set_name: str, model: str, found: Sequence[Verification]) -> HeldOu
         set_name=set_name,
         model=model,
         verdict=verdicts.most_common(1)[0][0],
-        uncorrected=rms("uncorrected"),
-        corrected=rms("corrected"),
-        predicted=rms("predicted"),
+        **{kind: rms(kind) for kind in ("uncorrected", "corrected", "predicted")},
         verdicts=dict(verdicts),
     )

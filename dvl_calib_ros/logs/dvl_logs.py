@@ -60,9 +60,6 @@ def _read_nortek(_path: Path, content: bytes) -> DvlLog:
     waters: list[WaterReading] = []
     left_out: Counter[str] = Counter()
     for data in _records(content):
-        if data is None:
-            left_out["damaged"] += 1
-            continue
         try:
             sample = _sample(data)
         except (struct.error, ValueError, OverflowError):
@@ -77,8 +74,8 @@ def _read_nortek(_path: Path, content: bytes) -> DvlLog:
     return DvlLog(samples, left_out, waters=waters)
 
 
-def _records(content: bytes) -> Iterator[bytes | None]:
-    """Yield the data of each bottom-track record with a sound header; None if damaged or cut off."""
+def _records(content: bytes) -> Iterator[bytes]:
+    """Yield the data of each bottom-track record with a sound header; nothing of it if damaged or cut off."""
     start = 0
     while (at := content.find(_SYNC, start)) >= 0:
         start = at + 1
@@ -90,7 +87,7 @@ def _records(content: bytes) -> Iterator[bytes | None]:
         data = content[at + size : at + size + length]
         if len(data) < length or _sum(data) != checksum:
             if identity == _NORTEK_BOTTOM_TRACK:
-                yield None
+                yield b""
             continue
         start = at + size + length
         if identity == _NORTEK_BOTTOM_TRACK:
@@ -412,18 +409,10 @@ def _applied_rotation(roll: float, pitch: float, heading: float, fixed: bytes) -
     fixed: fixed leader. (Same document, eq. 18.) The transpose undoes the rotation exactly, even if the heading is
     inaccurate.
     """
-    if not fixed[25] & 4:
-        roll = pitch = 0.0
-    sh, ch, sp, cp, sr, cr = (
-        math.sin(heading), math.cos(heading), math.sin(pitch), math.cos(pitch), math.sin(roll), math.cos(roll),
-    )  # fmt: skip
-    return np.array(
-        [
-            [ch * cr + sh * sp * sr, sh * cp, ch * sr - sh * sp * cr],
-            [-sh * cr + ch * sp * sr, ch * cp, -sh * sr - ch * sp * cr],
-            [-cp * sr, sp, cp * cr],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    tilts = [pitch, roll] if fixed[25] & 4 else [0.0, 0.0]
+    return np.asarray(Rotation.from_euler("ZXY", [-heading, *tilts]).as_matrix())
 
 
 # content kinds: test and reader; the first that matches is used

@@ -477,11 +477,10 @@ class CalibrationNode(AnsweringNode):
             return response
         try:
             self._save(Path(path), save)
-        except KeptError as error:
-            response.message = str(error)
         except InputError as error:
             response.message = str(error)
-            self.error(response.message)
+            if not isinstance(error, KeptError):
+                self.error(response.message)
         else:
             response.success, response.message = True, f"saved to {path}"
         return response
@@ -493,10 +492,9 @@ class CalibrationNode(AnsweringNode):
             with self._calibrator.settled():  # what is published is what is saved
                 save(path, self._result_document(), round(self._calibrator.parameters.result_backups))
                 self._publish_mounting(again=True)
-        except KeptError:
-            raise
         except InputError as error:
-            self._save_problem = finding("RESULT_NOT_SAVED", reason=error)
+            if not isinstance(error, KeptError):
+                self._save_problem = finding("RESULT_NOT_SAVED", reason=error)
             raise
 
     def _result_document(self) -> dict[str, Any]:

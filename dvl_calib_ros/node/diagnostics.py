@@ -465,7 +465,4 @@ def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) ->
     if not model.from_positions:  # these models use positions instead of DVL samples
         by_use = counts_by_use(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
         values |= {f"samples {name}": str(count) for name, count in by_use.items()}
-    for stream, tally in counts.items():
-        for name, count in tally.items():
-            values[f"{stream} {name}"] = str(count)
-    return values
+    return values | {f"{stream} {name}": str(n) for stream, tally in counts.items() for name, n in tally.items()}

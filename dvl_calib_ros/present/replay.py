@@ -185,11 +185,7 @@ def replayed(
         answer=_verdict_answer(verification),
         warnings=shown_warnings,
         sections=[
-            section(
-                "",
-                worth,
-                where=Where.PAGE,
-            ),
+            section("", worth, where=Where.PAGE),
             section(_headline(run, rejected), *([Sentence(NO_MOUNTING)] if rejected else _mounting(run))),
             section("", None if rejected else figures("replay_figures.mounting_pictures", result), where=Where.PAGE),
             section("", facts_by(FACTS, run), where=where),
@@ -385,16 +381,8 @@ class Term(NamedTuple):
 
 
 _DEGREE = math.degrees(1.0)
-ANGLES = (
-    Term(0, "φx", "Misalignment about x", "°", _DEGREE),
-    Term(1, "φy", "Misalignment about y", "°", _DEGREE),
-    Term(2, "φz", "Misalignment about z", "°", _DEGREE),
-)
-SCALES = (
-    Term(3, "δk x", "Scale error along x", " %", 100.0),
-    Term(4, "δk y", "Scale error along y", " %", 100.0),
-    Term(5, "δk z", "Scale error along z", " %", 100.0),
-)
+ANGLES = tuple(Term(k, f"φ{axis}", f"Misalignment about {axis}", "°", _DEGREE) for k, axis in enumerate("xyz"))
+SCALES = tuple(Term(3 + k, f"δk {axis}", f"Scale error along {axis}", " %", 100.0) for k, axis in enumerate("xyz"))
 ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
 
 
@@ -411,10 +399,15 @@ def scale_terms(model: Model) -> list[Term]:
     return terms
 
 
+def terms_of(models: Sequence[str]) -> tuple[Term, ...]:
+    """Return the error terms of some models: one for the scale, or one per axis if a model has several."""
+    per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in models)
+    return *ANGLES, *(SCALES if per_axis else (ANY_SCALE,))
+
+
 def estimate_table(result: Result, models: Sequence[str]) -> Table:
     """Return one row per model, the selected one marked."""
-    per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in models)
-    terms = (*ANGLES, *(SCALES if per_axis else (ANY_SCALE,)))
+    terms = terms_of(models)
     rows = []
     for name in models:
         estimate = result.estimates[name]

@@ -381,9 +381,8 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     unread: list[str] = []
     rules = VELOCITY_TYPES[msgtype].rules if msgtype in VELOCITY_TYPES else ()
     for part in parts:
-        for code in np.flatnonzero(np.bincount(part.decoded.broken)).tolist():
-            if code:  # 0: no rule is broken
-                refused[rules[code - 1].counter] += int(np.count_nonzero(part.decoded.broken == code))
+        counts = np.bincount(part.decoded.broken, minlength=1 + len(rules))[1:].tolist()  # 0: no rule is broken
+        refused.update({rule.counter: count for rule, count in zip(rules, counts, strict=True) if count})
     single_rows = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
     rows: list[_Row] = []
     position = VELOCITY_TYPES[msgtype].position if msgtype in VELOCITY_TYPES else None

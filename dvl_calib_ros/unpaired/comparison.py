@@ -359,7 +359,7 @@ def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
     selections = vehicle.selection, simulator.selection
     sides = {"vehicle": vehicle, "simulator": simulator}
     if selections[0] is None or selections[1] is None:
-        return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
+        return _nothing_to_compare({side: log.diagnosis for side, log in sides.items()})
     candidates = [*compare_noise(vehicle, simulator), *compare_streams(vehicle, simulator)]
     names = common_names(vehicle, simulator)
     compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names))
@@ -554,14 +554,15 @@ def _reasons(
     return tuple(reasons)
 
 
-def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedComparison:
+def _nothing_to_compare(sides: Mapping[str, Diagnosis]) -> UnpairedComparison:
     """Return the comparison if at least one side could not be diagnosed."""
     reasons = tuple(
         finding("SIMULATOR_NOTHING_COMPARED", side=side, why=diagnosis.reasons)
-        for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))
+        for side, diagnosis in sides.items()
         if diagnosis.selection is None
     )
-    sides: dict[str, dict[str, str]] = {"vehicle": {}, "simulator": {}}
+    not_shown: dict[str, dict[str, str]] = {side: {} for side in sides}
+    vehicle, simulator = sides.values()
     return UnpairedComparison(
-        SimulatorVerdict.CANNOT_TELL, reasons, (), (), {}, (), float("nan"), sides, vehicle, simulator
+        SimulatorVerdict.CANNOT_TELL, reasons, (), (), {}, (), float("nan"), not_shown, vehicle, simulator
     )
