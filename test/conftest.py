@@ -34,7 +34,7 @@ from hypothesis import HealthCheck, settings
 from dvl_calib_ros.calibration.estimators import registration_schedule
 from dvl_calib_ros.calibration.registration.frame_hypotheses import Readings
 from dvl_calib_ros.diagnosis import diagnose
-from dvl_calib_ros.discovery import clock_offsets
+from dvl_calib_ros.discovery import discovery
 from dvl_calib_ros.unpaired import both_sides
 
 # A busy machine takes its time over an example. Who waits for the suite sees fewer of them than CI, and both the same
@@ -167,7 +167,7 @@ def _add_to(digest: Any, value: Any) -> None:
 
 # Half of a replay. Its commands, formats and types are tested with the same few recordings; tests of the registration
 # itself import it from where it is.
-registration_schedule.register = clock_offsets.register = remembered(registration_schedule.register)
+registration_schedule.register = discovery.register = remembered(registration_schedule.register)
 registration_schedule.fitting_configuration = remembered(registration_schedule.fitting_configuration)
 # All of `diagnose` but reading: its options, pages and comparisons are tested with the same few recordings.
 diagnose.diagnose_recordings = both_sides.diagnose_recordings = remembered(diagnose.diagnose_recordings)

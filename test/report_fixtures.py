@@ -24,7 +24,6 @@ from dvl_calib_ros.diagnosis.answer.noise_findings import NoiseFinding
 from dvl_calib_ros.diagnosis.answer.plotted_series import DiagnosisSeries, RegressorPlot
 from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
-from dvl_calib_ros.evaluation.convergence import TIMES_S
 from dvl_calib_ros.evaluation.cross_check import CrossCheck
 from dvl_calib_ros.evaluation.results import (
     UNCALIBRATED,
@@ -36,6 +35,7 @@ from dvl_calib_ros.evaluation.results import (
     Evaluation,
     HeldOut,
 )
+from dvl_calib_ros.evaluation.validation_study import TIMES_S
 from dvl_calib_ros.present.page import write_report
 from dvl_calib_ros.present.replay import replayed as document_of
 from dvl_calib_ros.verdict.reasons import finding

@@ -31,8 +31,7 @@ from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulation.trajectories import Waves
 from dvl_calib_ros.simulator_export.dvl_description import load_description
-from dvl_calib_ros.simulator_export.registry import SIMULATORS
-from dvl_calib_ros.simulator_export.writer import export
+from dvl_calib_ros.simulator_export.simulators import SIMULATORS, export
 from dvl_calib_ros.unpaired.both_sides import Log, RecordedSide, read_log
 from dvl_calib_ros.unpaired.comparison import compare_logs
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from stacks import FIX, GNSS_STD, IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, true_mounting
 
 import dvl_calib_ros
-from dvl_calib_ros.api import arguments
+from dvl_calib_ros.api import analyse
 from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.examination import examine
@@ -314,7 +314,7 @@ def ask_once(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("discover", "checked_replay"):
         original = getattr(examine, name)
         monkeypatch.setattr(examine, name, once(getattr(original, "__wrapped__", original)))
-    monkeypatch.setattr(arguments, "discover", examine.discover)
+    monkeypatch.setattr(analyse, "discover", examine.discover)
 
 
 NOISY = "accept", "marginal"  # speed over ground is noisy, and without a reference nothing is verified

@@ -80,19 +80,16 @@ class Mounting:
     def __str__(self) -> str:
         angles = zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
         parts = [f"{name} {angle:.2f}° ± {std:.2f}°{self._remark(name)}" for name, angle, std in angles]
-        arm = zip("xyz", self.xyz_m, self.xyz_std_m, strict=True)
+        arm = ", ".join(
+            f"{axis} {value:.2f} ± {std:.2f} m{self._remark(f'lever arm {axis}')}"
+            for axis, value, std in zip("xyz", self.xyz_m, self.xyz_std_m, strict=True)
+        )
         if all(map(math.isnan, self.xyz_std_m)):
-            parts.append("lever arm {:g} {:g} {:g} m as configured, not estimated".format(*self.xyz_m))
-        else:
-            values = (
-                f"{axis} {value:.2f} ± {std:.2f} m{self._remark(f'lever arm {axis}')}" for axis, value, std in arm
-            )
-            parts.append(f"lever arm {', '.join(values)}")
+            arm = "{:g} {:g} {:g} m as configured, not estimated".format(*self.xyz_m)
+        offset = f"{self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s{self._remark(LATE)}"
         if math.isnan(self.time_offset_std_s):
-            parts.append(f"{LATE} {self.time_offset_s:g} s as configured, not estimated")
-        else:
-            offset = f"{self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s"
-            parts.append(f"{LATE} {offset}{self._remark(LATE)}")
+            offset = f"{self.time_offset_s:g} s as configured, not estimated"
+        parts += [f"lever arm {arm}", f"{LATE} {offset}"]
         return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(parts)}")
 
     def _remark(self, name: str) -> str:

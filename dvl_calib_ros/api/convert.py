@@ -11,7 +11,7 @@ from ..diagnosis.answer.results import Diagnosis
 from ..disk.text_files import write_json
 from ..errors import InputError, needing_page
 from ..examination.examine import Examination
-from .arguments import Bags, StrPath, as_path, as_paths, storage_and_compression
+from .analyse import Bags, StrPath, as_path, as_paths, storage_and_compression
 from .calibrated import Calibration
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..files.mounting import Applied
     from ..instruments.settings import InstrumentSettings
     from ..logs.trajectories import Imported
-    from ..simulator_export.writer import Export
+    from ..simulator_export.simulators import Export
     from ..unpaired.results import UnpairedComparison
 
 
@@ -216,7 +216,7 @@ def export(simulator: str, source: StrPath, output: StrPath) -> Export:
     InputError
         For an unknown simulator, another kind of source, or a file that cannot be written.
     """
-    from ..simulator_export.registry import write_settings
+    from ..simulator_export.simulators import write_settings
 
     return write_settings(simulator, Path(source), Path(output))
 

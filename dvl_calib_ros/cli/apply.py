@@ -19,7 +19,6 @@ from . import common
 
 if TYPE_CHECKING:
     from ..files.mounting import CalibratedMounting
-    from ..instruments.settings import InstrumentSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,7 +115,8 @@ def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Nam
             "--send is for waterlinked, and needs its settings when the data were recorded: "
             + " ".join(f"--now {name}=..." for name in missing or ("mounting_rotation_offset",))
         )
-    _print_lines(calibrated, _settings_lines(chosen))
+    lines = [f"{chosen.instrument}, by: {chosen.document}", *(f"  {setting}" for setting in chosen.settings)]
+    _print_lines(calibrated, [*lines, *chosen.text.splitlines(), *(f"note: {note}" for note in chosen.notes)])
     if arguments.settings and not arguments.dry_run:
         save_bytes(arguments.settings, chosen.text.encode())
         show(f"{arguments.settings}: written")
@@ -136,16 +136,6 @@ def _parse_now(words: Sequence[str]) -> dict[str, float]:
         except ValueError as error:
             raise InputError(f"--now {word}: is not NAME=VALUE with a number") from error
     return settings
-
-
-def _settings_lines(chosen: InstrumentSettings) -> list[str]:
-    """Return the settings of an instrument, with document and notes, as lines to print."""
-    return [
-        f"{chosen.instrument}, by: {chosen.document}",
-        *(f"  {setting}" for setting in chosen.settings),
-        *chosen.text.splitlines(),
-        *(f"note: {note}" for note in chosen.notes),
-    ]
 
 
 def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:

@@ -29,7 +29,11 @@ if TYPE_CHECKING:
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """Add --params and -p, as in ROS 2, and --profile, which stores them."""
-    add_profile_option(parser)
+    parser.add_argument(
+        "--profile", metavar="NAME",
+        help="profile of topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file, or none for no profile; "
+        f"default: {IN_FOLDER} of this folder",
+    )  # fmt: skip
     parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
     override = parser.add_argument(
         "-p", dest="overrides", action="append", default=[], metavar="NAME:=VALUE", help="set one parameter; repeatable"
@@ -73,14 +77,17 @@ def opened(bags: Sequence[Path], parameters: Parameters) -> Recording:
         return open_recording(bags, None, parameters, on_progress)
 
 
-def discovered(arguments: argparse.Namespace, recording: Recording, parameters: Parameters) -> Discovery:
-    """Find topics, mounting and frames in a recording; options take precedence. Raises InputError.
+def discovered(
+    arguments: argparse.Namespace, bags: Sequence[Path], parameters: Parameters
+) -> tuple[Recording, Discovery]:
+    """Open recordings and find their topics, mounting and frames; options take precedence. Raises InputError.
 
     parameters: as loaded by `load` from the same options.
     """
     from ..discovery.discover import discover
 
-    return discover(recording, parameters, given(arguments))
+    recording = opened(bags, parameters)
+    return recording, discover(recording, parameters, given(arguments))
 
 
 def given(arguments: argparse.Namespace) -> Given:
@@ -345,15 +352,6 @@ def result_files(arguments: argparse.Namespace, result: Any) -> list[tuple[Path 
 IN_FOLDER = Path(".dvl-calib.yaml")
 # Options that a profile may hold next to `parameters`. None names an output file.
 OPTIONS = ("dvl-topic", "gnss-topic", "imu-topic", "params")
-
-
-def add_profile_option(parser: argparse.ArgumentParser) -> None:
-    """Add --profile."""
-    parser.add_argument(
-        "--profile", metavar="NAME",
-        help="profile of topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file, or none for no profile; "
-        f"default: {IN_FOLDER} of this folder",
-    )  # fmt: skip
 
 
 def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str]:

@@ -73,9 +73,7 @@ def _load_or_calibrate(arguments: argparse.Namespace, path: Path, name: str, not
         return load_extrinsics(path, name)
     from ..bag_replay.checked_replay import calibrated
 
-    parameters = common.load(arguments)
-    recording = common.opened([path], parameters)
-    discovery = common.discovered(arguments, recording, parameters)
+    recording, discovery = common.discovered(arguments, [path], common.load(arguments))
     with common.progress(f"replaying {name}") as on_progress:
         found = calibrated(recording, discovery.parameters, discovery.topics, name, on_progress)
     notes += [f"{name}: {note}" for note in found.notes]

@@ -92,7 +92,7 @@ def _show_live(out: Any, bag: Path, speed: float) -> None:
     """Play the bag to the node and show its estimates live."""
     from rich.live import Live
 
-    from ..demo.watch import Watcher
+    from ..demo.player import Watcher
 
     watcher = Watcher([bag], _truth())
     out.print(f"[bold]1. Live[/]: node and player are two processes, ROS domain {os.environ['ROS_DOMAIN_ID']}")
@@ -121,7 +121,6 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     """Print live and replayed estimates; return whether they agree to rounding."""
     import numpy as np
 
-    from ..disk.text_files import load_yaml
     from ..files.result_file import load_result
     from ..present.document import Table
     from ..present.replay import estimate_table
@@ -129,7 +128,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`")
     out.print()
-    _, live = load_result(saved)
+    content, live = load_result(saved)
     found = estimate_table(offline, list(offline.estimates))
     truth = ("truth", *(f"{value:+.2f}" for value in _truth().values()))
     of_these = [row[: len(truth)] for row in found.rows]  # only the columns that have a truth
@@ -139,10 +138,11 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
         for name, estimate in offline.estimates.items()
         for live_value, replay_value in ((live[name].x, estimate.state), (live[name].p, estimate.covariance))
     )
-    model = load_yaml(saved, "result file")["model"]
     start_ns = offline.first_ns or 0
     switches = ", ".join(f"{(at - start_ns) * 1e-9:.1f} s {name}" for at, name in offline.segments)
-    out.print(f"The node ended on {model}, the replay on {offline.selected}; auto selected, by stamp: {switches}.")
+    out.print(
+        f"The node ended on {content['model']}, the replay on {offline.selected}; auto selected, by stamp: {switches}."
+    )
     verdict = "agree" if worst < 1e-12 else "[red]DIFFER[/] (if the machine is too busy to keep up: --speed 5)"
     out.print(f"Live and offline {verdict}: the largest difference in any state or covariance is {worst:.1e}.")
     return worst < 1e-12

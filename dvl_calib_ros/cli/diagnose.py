@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from ..errors import InputError
 from . import common
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from ..discovery.discovery import Discovery
     from ..unpaired.both_sides import RecordedSide
@@ -53,8 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose, print, save. Return 1 if the data do not answer."""
     if arguments.simulator:
-        return run_against_simulator(arguments, DEFAULTS)
-    check_without(arguments)
+        return run_against_simulator(arguments)
+    for option in NEEDS_SIMULATOR:
+        if getattr(arguments, option) is not None:
+            raise InputError(f"--{option.replace('_', '-')} works only with --simulator")
     from ..diagnosis.answer.compensation import parameter_file, verified_corrections
     from ..diagnosis.answer.posterior_samples import with_samples
     from ..diagnosis.answer.results import DiagnosisVerdict
@@ -80,8 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         | ({} if sampled is None else {"--samples": sampled}),
     )
     _check_twins(arguments.twin, names)
-    recording = common.opened(arguments.bags, parameters)
-    discovery = common.discovered(arguments, recording, parameters)
+    recording, discovery = common.discovered(arguments, arguments.bags, parameters)
     parameters = discovery.diagnosed
     rejected = rejection(recording, discovery)  # before the messages are forgotten
     with common.progress("diagnosing") as on_progress:
@@ -118,16 +120,12 @@ def run(arguments: argparse.Namespace) -> int:
         files = {day: each for day, each in corrections.items() if own_stream(paths[day]) is None}
         written.extend(f"wrote {paths[day]}: {each.sentence}" for day, each in files.items())
 
-    def write_all_twins(folder: Path) -> None:
-        for twin in diagnosis.twins:
-            write_twins(folder, twin)
-
     common.deliver(
         answer,
         *common.result_files(arguments, diagnosis),
         (sampled, lambda path: common.write_json(path, with_samples(diagnosis, count))),
         (arguments.apply, apply),
-        (arguments.twin, write_all_twins),
+        (arguments.twin, lambda folder: [*map(partial(write_twins, folder), diagnosis.twins)]),
     )
     cannot = diagnosis.verdict in (DiagnosisVerdict.UNKNOWN, DiagnosisVerdict.INSUFFICIENT_EXCITATION)
     return int(cannot or diagnosis.reasons[0].severity is Severity.REJECT)
@@ -188,14 +186,7 @@ def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def check_without(arguments: argparse.Namespace) -> None:
-    """Raise InputError for options that need --simulator."""
-    for option in NEEDS_SIMULATOR:
-        if getattr(arguments, option) is not None:
-            raise InputError(f"--{option.replace('_', '-')} works only with --simulator")
-
-
-def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> int:
+def run_against_simulator(arguments: argparse.Namespace) -> int:
     """Compare, print, save. Return 1 if the recordings cannot answer."""
     from ..present.result_documents import DOCUMENTS
     from ..unpaired.results import SimulatorVerdict
@@ -206,8 +197,8 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
             raise InputError(f"--{option} works only without --simulator")
     check_rounds(arguments.rounds, arguments.keep)
     common.check_outputs(arguments, "json", "report", folders=["keep"])
-    real = _open_side(arguments, arguments.bags, arguments.params, defaults)
-    sim = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
+    real = _open_side(arguments, arguments.bags, arguments.params)
+    sim = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params)
     with common.progress("comparing") as on_progress:
         found = against(
             real[0], sim[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
@@ -223,13 +214,12 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
 
 
 def _open_side(
-    arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None, defaults: Mapping[str, float]
+    arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None
 ) -> tuple[RecordedSide, Discovery]:
     """Open one side's bags and discover their topics and frames."""
     from ..unpaired.both_sides import RecordedSide
 
     side_arguments = argparse.Namespace(**{**vars(arguments), "params": params})
-    recording = common.opened(bags, common.load(side_arguments))
-    discovery = common.discovered(side_arguments, recording, common.load(side_arguments))
-    parameters = common.load(side_arguments, defaults).replace(**discovery.values)
+    recording, discovery = common.discovered(side_arguments, bags, common.load(side_arguments))
+    parameters = common.load(side_arguments, DEFAULTS).replace(**discovery.values)
     return RecordedSide(recording, parameters, discovery.topics), discovery

@@ -12,13 +12,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from . import common
-
-if TYPE_CHECKING:
-    from ..parallel import Workers
 
 MAX_SEEDS = 10_000
 
@@ -44,6 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Run the evaluation or the cross-check, print its document, and write the requested files."""
     from ..calibration.models import BY_VELOCITY
     from ..disk.atomic import save_text
+    from ..evaluation.cross_check import cross_check
     from ..evaluation.documents import evaluation_csv
     from ..evaluation.protocol import SETS
     from ..evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
@@ -63,7 +60,14 @@ def run(arguments: argparse.Namespace) -> None:
     common.check_outputs(arguments, "json", "csv", "report")
     workers = Workers(arguments.jobs, arguments.dask)
     if are_bags:
-        _cross_check(arguments, models, workers)
+        if arguments.csv is not None:
+            raise InputError("--csv: only for a folder of trajectories; for bags there is --json")
+        with common.progress("replaying") as on_progress:
+            given = common.given(arguments)
+            check = cross_check(arguments.paths, common.load(arguments), models, given, workers, on_progress)
+        common.deliver(
+            lambda: common.print_document(present.cross_check(check)), *common.result_files(arguments, check)
+        )
         return
     parameters = common.load(arguments, DEFAULTS)
     with common.progress("evaluating") as on_progress:
@@ -96,20 +100,3 @@ def _are_bags(paths: list[Path]) -> bool:
     if len(paths) == 1:
         raise InputError(f"{paths[0]}: one bag cannot be checked against another; name two at least, or use replay")
     return True
-
-
-def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
-    """Check each bag's calibration on the other bags; print and save."""
-    from ..evaluation.cross_check import cross_check
-    from ..present import evaluation as present
-
-    if arguments.csv is not None:
-        raise InputError("--csv: only for a folder of trajectories; for bags there is --json")
-    with common.progress("replaying") as on_progress:
-        check = cross_check(
-            arguments.paths, common.load(arguments), models, common.given(arguments), workers, on_progress
-        )
-    common.deliver(
-        lambda: common.print_document(present.cross_check(check)),
-        *common.result_files(arguments, check),
-    )

@@ -9,17 +9,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from . import common
-
-if TYPE_CHECKING:
-    from ..simulator_export.writer import Export
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..simulator_export.registry import SIMULATORS
+    from ..simulator_export.simulators import SIMULATORS
 
     parser.add_argument("simulator", choices=tuple(SIMULATORS), metavar="SIMULATOR", help=", ".join(SIMULATORS))
     parser.add_argument(
@@ -31,21 +27,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the settings for the simulator and the list of what is missing, and print a summary."""
-    from ..simulator_export.registry import missing_beside, write_settings
+    from ..present.document import Table
+    from ..present.terminal import rich_table
+    from ..simulator_export.simulators import missing_beside, write_settings
 
     missing = missing_beside(arguments.output)
     also_written = {} if missing is None else {"--output, for missing effects,": missing}
     common.check_outputs(arguments, "output", also_written=also_written)
     exported = write_settings(arguments.simulator, arguments.source, arguments.output, arguments.sample)
-    if missing is not None:
-        _print(exported, arguments)
-
-
-def _print(exported: Export, arguments: argparse.Namespace) -> None:
-    """Print which settings were written, and which errors the simulator cannot represent."""
-    from ..present.document import Table
-    from ..present.terminal import rich_table
-
+    if missing is None:
+        return
     out = common.console()
     out.print(f"wrote {arguments.output}: {', '.join(exported.settings.found)}", soft_wrap=True, markup=False)
     if exported.settings.defaults:

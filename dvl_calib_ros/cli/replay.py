@@ -47,8 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     models = list(MODELS) if arguments.verbose or not extra else extra
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "save", "report")
-    recording = common.opened(arguments.bags, parameters)
-    discovery = common.discovered(arguments, recording, parameters)
+    recording, discovery = common.discovered(arguments, arguments.bags, parameters)
     with common.progress("replaying") as on_progress:
         replayed = judged_replay(
             recording, discovery, on_progress, merge=arguments.merge, with_history=arguments.report is not None

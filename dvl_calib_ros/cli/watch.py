@@ -75,12 +75,15 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
         )  # fmt: skip
         try:
             assert process.stdout is not None  # a pipe
-            log = _Log(process.stdout)
-            show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines, True)
-            n_shown = len(log.lines) if process.poll() is None else 0  # number of lines already on the screen
+            log: list[str] = []
+            collecting = threading.Thread(target=_collect, args=(process.stdout, log), daemon=True)
+            collecting.start()
+            show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log, True)
+            n_shown = len(log) if process.poll() is None else 0  # number of lines already on the screen
         finally:
             code = _end_process(process)
-        for text in log.finished()[n_shown:]:
+        collecting.join()
+        for text in log[n_shown:]:
             say(text)
     return code
 
@@ -110,23 +113,10 @@ def _end_process(process: subprocess.Popen[bytes]) -> int:
         return process.wait()
 
 
-class _Log:
-    """Collector of the node's log, so that it neither garbles the view nor is lost."""
-
-    def __init__(self, pipe: IO[bytes]) -> None:
-        self.lines: list[str] = []
-        self._pipe = pipe
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        for raw in self._pipe:
-            self.lines.append(raw.decode(errors="replace").rstrip())
-
-    def finished(self) -> list[str]:
-        """Return all lines of a node that has ended."""
-        self._thread.join()
-        return self.lines
+def _collect(pipe: IO[bytes], lines: list[str]) -> None:
+    """Collect the lines of the node's log, so that it neither garbles the view nor is lost."""
+    for raw in pipe:
+        lines.append(raw.decode(errors="replace").rstrip())
 
 
 # Age of the last /diagnostics, published at 1 Hz, after which the node or the network counts as gone, s.

@@ -22,11 +22,10 @@ from ..calibration.registration.frame_hypotheses import ImuFrame, least_turn, no
 from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..messages.decode import turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.topic_preview import Survey
+from ..recordings.topic_messages import Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_offsets import imu_columns_of
-from .discovery import as_option, in_time_of
+from .discovery import as_option, imu_columns_of, in_time_of
 from .frame_choice import SAME_ANSWER
 
 # Interval over which the speed ahead changes in a turn, s: longer than waves, shorter than a change of throttle.

@@ -32,15 +32,24 @@ from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recording import Recording, open_recording
-from ..recordings.topic_preview import Preview, Survey
+from ..recordings.topic_messages import Preview, Survey
 from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .axis_signs import sign_findings
-from .clock_offsets import compared_motion, difference_of, on_imu_clock
-from .discovery import Discovery, Given, as_option, clocks_of_recording, in_time_of, mounting_guessed
-from .frame_choice import AXES, FrameChoice, FrameChooser, declared_reference
-from .gravity import Gravity, believed_heading
+from .discovery import (
+    Discovery,
+    Given,
+    as_option,
+    clocks_of_recording,
+    compared_motion,
+    difference_of,
+    in_time_of,
+    mounting_guessed,
+    on_imu_clock,
+)
+from .frame_choice import AXES, FrameChooser, declared_reference
+from .gravity import believed_heading, contradictions
 from .transforms import FrameTree, Placed, in_degrees, in_metres
 
 # a smaller rotation in the data is a misalignment to calibrate; a larger one is another mounting
@@ -144,19 +153,12 @@ class _Search:
         given, default = self._given, Topics()
         dvl = self._checked("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._survey, default.dvl, self._where)
         self._notes += topic_choice.other_dvls(self._survey, dvl, difference_of)
-        gnss, imu = default.gnss, default.imu
-        if given.gnss_topic is None:
-            chosen, notes = topic_choice.choose_reference(self._survey, default.gnss, dvl, difference_of)
-            gnss = chosen or default.gnss
+        gnss, imu = self._checked("gnss", given.gnss_topic), self._checked("imu", given.imu_topic)
+        if gnss is None:
+            gnss, notes = topic_choice.choose_reference(self._survey, default.gnss, dvl, difference_of)
             self._notes += notes
-        elif given.gnss_topic != NONE:
-            gnss = self._checked("gnss", given.gnss_topic) or gnss
-        else:
-            gnss = NONE
-        if given.imu_topic is None:
-            imu = topic_choice.choose_imu(self._survey, default.imu, gnss) or default.imu
-        else:
-            imu = NONE if given.imu_topic == NONE else self._checked("imu", given.imu_topic) or imu
+        gnss = gnss or default.gnss
+        imu = imu or topic_choice.choose_imu(self._survey, default.imu, gnss) or default.imu
         if imu.endswith(ORIENTATION) and imu in self._survey.topics:
             self._found.append(
                 f"no IMU gives an attitude; it is the orientation of {imu.removesuffix(ORIENTATION)}, and turn rates "
@@ -165,8 +167,10 @@ class _Search:
         return Topics(dvl, gnss, imu)
 
     def _checked(self, role: str, name: str | None) -> str | None:
-        """Return a named topic if the recording has it with a usable type. Raises InputError."""
-        return None if name is None else topic_choice.checked_topic(role, name, self._survey, self._where)
+        """Return a named topic if the recording has it with a usable type, or NONE. Raises InputError."""
+        if name is None or (name == NONE and role != "dvl"):
+            return name
+        return topic_choice.checked_topic(role, name, self._survey, self._where)
 
     def _describe_topics(self, topics: Topics) -> str:
         """Describe the chosen topics with type, frame and rate, for the first line of the output."""
@@ -210,8 +214,11 @@ class _Search:
                 "(-p use_message_covariance:=false)"
             )
         self._lower_min_speed(dvl)
-        if reference is not None:
-            chosen = self._fit(frames, dvl, reference, imu, mounting, placed)
+        if reference is not None and (motion := compared_motion(dvl, reference, imu)) is not None:
+            position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
+            self._readings = Readings(motion, position)
+            is_known = _is_located(placed) and self._known_reference_position(reference) is not None
+            chosen = frames.choose(self._readings, reference, None if mounting is None else mounting.T, is_known)
         imu_choice = frames.imu if chosen is None else chosen.imu
         self._use_base_axes(imu_choice is not None and imu_choice.z_down)
         is_turned = frames.dvl_is_turned(self._is_z_down)
@@ -243,7 +250,8 @@ class _Search:
         self._set_position(placed, reference)
         if imu is not None:
             self._use_claimed_heading(imu)
-            self._check_gravity(imu)
+            parameters = self._parameters.replace(**self._values)
+            self._contradictions += contradictions(imu.topic, imu.values[:, :4], imu.values[:, 7:], parameters)
 
     def _lower_min_speed(self, dvl: Preview) -> None:
         """Set min_speed of a vehicle that mostly moves more slowly than the default."""
@@ -271,16 +279,6 @@ class _Search:
                 f"{base} is forward-right-down by the IMU's attitude and its transform: mounting and "
                 "lever arm are in these axes (base_axes frd)"
             )
-
-    def _check_gravity(self, imu: Preview) -> None:
-        """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
-        gravity, parameters = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
-        if gravity is not None and (
-            found := gravity.contradiction(
-                imu.topic, rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, parameters.is_z_down
-            )
-        ):
-            self._contradictions.append(found)
 
     def _use_claimed_heading(self, imu: Preview) -> None:
         """Set the heading accuracy that the IMU claims."""
@@ -365,27 +363,6 @@ class _Search:
             return True
         fit = self._chosen  # a reference in the body frame agrees regardless of the IMU
         return fit is not None and not fit.reading.in_body and fit.best_residual < MAX_RESIDUAL
-
-    def _fit(
-        self,
-        frames: FrameChooser,
-        dvl: Preview,
-        reference: Preview,
-        imu: Preview | None,
-        mounting: Array | None,
-        placed: Placed | None,
-    ) -> FrameChoice | None:
-        """Choose the frames under which DVL and reference agree best; None without common motion.
-
-        mounting: rotation_body_from_dvl (3, 3) from transforms or parameters, None if unknown.
-        """
-        position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
-        motion = compared_motion(dvl, reference, imu)
-        if motion is None:
-            return None
-        self._readings = Readings(motion, position)
-        is_known = _is_located(placed) and self._known_reference_position(reference) is not None
-        return frames.choose(self._readings, reference, None if mounting is None else mounting.T, is_known)
 
     def _use_reading(self, chosen: Agreement, mounting: Array | None, reference: Preview, imu: Preview | None) -> None:
         """Write the frames and mounting of a reading into the parameters.

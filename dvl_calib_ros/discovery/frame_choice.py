@@ -40,12 +40,11 @@ from ..calibration.registration.frame_hypotheses import (
 from ..calibration.streams.imu_frame import ENU_FROM
 from ..calibration.streams.interpolation import GAP_S, TurnRates, angular_velocity_at
 from ..calibration.streams.screening import unit_quaternions
-from ..messages.decode import DECLARED_FRAMES, DeclaredFrame, frame_named
+from ..messages.decode import DeclaredFrame, declared_frame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.topic_preview import Preview
+from ..recordings.topic_messages import Preview
 from ..verdict.reasons import Reason, finding
-from .clock_offsets import imu_columns_of
-from .discovery import as_option
+from .discovery import as_option, imu_columns_of
 from .gravity import Gravity
 from .transforms import Placed, in_degrees
 
@@ -459,12 +458,7 @@ def _arm_odds(fit: Registered) -> float:
 
 def declared_reference(reference: Preview, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:
     """Return the frame that a reference declares; None if none."""
-    if parameters.gnss_frame != FROM_FRAME_ID:
-        return DECLARED_FRAMES[parameters.gnss_frame]
-    of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
-    if of_type is not None:
-        return DeclaredFrame(of_type)
-    return frame_named(reference.frame_id, (parameters.base_frame, base_frame))
+    return declared_frame(VELOCITY_TYPES[reference.msgtype], reference.frame_id, parameters, base_frame)
 
 
 def twist_axes(preview: Preview) -> str | None:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.models.parameters import IMU_ENU, IMU_NED, rpy_text
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion
+from ..calibration.models.parameters import IMU_ENU, IMU_NED, Parameters, rpy_text
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion, rotation_from_rpy
 from ..calibration.streams.screening import unit_quaternions
 from ..verdict.reasons import Reason, finding
 
@@ -93,6 +93,13 @@ class Gravity(NamedTuple):
 
     def _up(self, world: str) -> float:
         return float(self.world[2]) * (-1.0 if world == "ned" else 1.0)
+
+
+def contradictions(topic: str, orientation: Array, acceleration: Array, parameters: Parameters) -> list[Reason]:
+    """Return what gravity says against the configured convention of an IMU, from its quaternions and accelerations."""
+    gravity, rotation = Gravity.of(orientation, acceleration), rotation_from_rpy(parameters.imu_rpy)
+    found = gravity and gravity.contradiction(topic, rotation, parameters.imu_frame, parameters.is_z_down)
+    return [found] if found else []
 
 
 # Limits of a believed heading σ (rad): few IMUs are better than the first, and one that claims more than the second

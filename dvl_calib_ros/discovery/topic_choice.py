@@ -13,7 +13,7 @@ from ..recordings.topics import ORIENTATION, spelled
 from ..verdict.reasons import Reason, finding
 
 if TYPE_CHECKING:
-    from ..recordings.topic_preview import Preview, Survey
+    from ..recordings.topic_messages import Preview, Survey
 
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
 # Satellites first, then other navigation systems. A simulator's truth is equivalent to either.
@@ -99,7 +99,10 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
         unlisted = [name for name in survey.field_maps if not _contains_word(name, (*DERIVED_WORDS, *COMMAND_WORDS))]
         unlisted.sort(key=lambda name: not _contains_word(f"{name} {present[name]}", DVL_WORDS))
         fields = "".join(f", or read {name} with --dvl-fields {survey.field_maps[name]}" for name in unlisted[:1])
-        raise InputError(f"{where}: no topic looks like a DVL's; name it with --dvl-topic{fields}. {_listing(survey)}")
+        unread = {name: f", which cannot be decoded: {why}" for name, why in survey.unread.items()}
+        held = ", ".join(f"{name} ({kind}{unread.get(name, '')})" for name, kind in sorted(present.items()))
+        listing = f"The bag has: {held}" if held else "The bag is empty"
+        raise InputError(f"{where}: no topic looks like a DVL's; name it with --dvl-topic{fields}. {listing}")
     order = list(DVL_TYPES)
     # of several forms of one velocity, prefer the plain type, then the raw one
     order.sort(key=lambda name: (name in REFERENCE_TYPES, name != TWIST_TYPE))
@@ -157,20 +160,16 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
             continue
         kind = next((i for i, words in enumerate((GNSS_WORDS, TRUTH_WORDS, INS_WORDS)) if _has(preview, words)), 3)
         fits = 0.0 if share is None or share < 0.5 else 1.0
-        ranked.append(((fits, kind, _rank(preview), -preview.rate_hz), preview))
+        is_position = REFERENCE_TYPES[preview.msgtype].position is not None
+        # of several forms of one velocity, first the one with a covariance, last positions
+        form = 2.0 if is_position else 0.0 if preview.msgtype == TWIST_TYPE else 1.0
+        ranked.append(((fits, kind, form, -preview.rate_hz), preview))
     if not ranked:
         return None, reasons
     chosen, *others = [topic for _, topic in sorted((order, preview.topic) for order, preview in ranked)]
     if others:
         reasons.append(finding("SEVERAL_REFERENCES", topic=chosen, others=", ".join(others)))
     return chosen, reasons
-
-
-def _rank(preview: Preview) -> float:
-    """Return the sort key of forms of one velocity: with a covariance first, positions last."""
-    if REFERENCE_TYPES[preview.msgtype].position is not None:
-        return 2.0
-    return 0.0 if preview.msgtype == TWIST_TYPE else 1.0
 
 
 def choose_imu(survey: Survey, default: str, reference: str = "") -> str | None:
@@ -189,9 +188,3 @@ def choose_imu(survey: Survey, default: str, reference: str = "") -> str | None:
         return (not preview.has_orientation, preview.topic != of_poses, _has(preview, DVL_WORDS), *last)
 
     return min(previews, key=order).topic
-
-
-def _listing(survey: Survey) -> str:
-    unread = {name: f", which cannot be decoded: {why}" for name, why in survey.unread.items()}
-    held = ", ".join(f"{name} ({kind}{unread.get(name, '')})" for name, kind in sorted(survey.topics.items()))
-    return f"The bag has: {held}" if held else "The bag is empty"

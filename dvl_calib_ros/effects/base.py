@@ -147,15 +147,19 @@ class EffectParameter:
         return self.name if self.said is None else self.said
 
 
+def within(
+    name: str, unit: str, typical: float, bound: float, description: str, said: str, linear: bool = True
+) -> EffectParameter:
+    """Return a parameter within ±bound."""
+    return EffectParameter(name, unit, typical, -bound, bound, description, linear=linear, said=said)
+
+
 def along_axes(
     suffix: str, unit: str, typical: float, bound: float, description: str, linear: bool = True
 ) -> tuple[EffectParameter, ...]:
     """Return a parameter for each of x, y and z, within ±bound; `{}` in the description is the axis."""
     return tuple(
-        EffectParameter(
-            f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis), linear=linear, said=axis
-        )
-        for axis in "xyz"
+        within(f"{axis}_{suffix}", unit, typical, bound, description.format(axis), axis, linear) for axis in "xyz"
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.numerics.frames import Array
-from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
+from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter, within
 
 _CURRENT = "{} component of the added velocity (the negative of the current)"
 
@@ -24,8 +24,8 @@ class WaterLock(Effect):
     )
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (
-        EffectParameter("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east"), said="east"),
-        EffectParameter("north_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("north"), said="north"),
+        within("east_mps", "m/s", 0.1, 5.0, _CURRENT.format("east"), "east"),
+        within("north_mps", "m/s", 0.1, 5.0, _CURRENT.format("north"), "north"),
         EffectParameter(
             "from_s", "s", 0.0, 0.0, math.inf, "when it begins, since the start", linear=False, said="from"
         ),
@@ -63,17 +63,11 @@ class HeadingError(Effect):
     remedy = "calibrate the compass, away from magnetic material; a mounting cannot cause this"
     manoeuvre = "straight legs on eight headings, at two speeds"
     parameters = (
-        EffectParameter(
-            "sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False, said="sin"
-        ),
-        EffectParameter(
-            "cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False, said="cos"
-        ),
-        EffectParameter("sin2_rad", "rad", 0.02, -0.5, 0.5, "part in phase with sin 2ψ", linear=False, said="sin 2ψ"),
-        EffectParameter("cos2_rad", "rad", 0.02, -0.5, 0.5, "part in phase with cos 2ψ", linear=False, said="cos 2ψ"),
-        EffectParameter(
-            "rad_per_hour", "rad/h", 0.05, -2.0, 2.0, "part that grows with time", linear=False, said="drift"
-        ),
+        within("sin_rad", "rad", 0.02, 0.5, "part in phase with the sine of yaw", "sin", linear=False),
+        within("cos_rad", "rad", 0.02, 0.5, "part in phase with the cosine of yaw", "cos", linear=False),
+        within("sin2_rad", "rad", 0.02, 0.5, "part in phase with sin 2ψ", "sin 2ψ", linear=False),
+        within("cos2_rad", "rad", 0.02, 0.5, "part in phase with cos 2ψ", "cos 2ψ", linear=False),
+        within("rad_per_hour", "rad/h", 0.05, 2.0, "part that grows with time", "drift", linear=False),
     )
     rarer = frozenset({"sin2_rad", "cos2_rad", "rad_per_hour"})
     per_recording = True

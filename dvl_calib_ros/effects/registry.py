@@ -6,20 +6,21 @@ cable_drag = "my_vehicle.effects:CableDrag"
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections import UserDict
+from collections.abc import Iterable
 from functools import cached_property, lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from itertools import chain, groupby
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 from ..errors import InputError
-from . import environment, kinematic, noise, sensor, timing
+from . import environment, noise, sensor, timing
 from .base import ActsOn, AnyEffect, ClockEffect, Effect, MountingEffect, NoiseEffect
 
 ENTRY_POINTS = "dvl_calib_ros.effects"
 
 OWN: tuple[type[AnyEffect], ...] = (
-    kinematic.LeverArm,
+    sensor.LeverArm,
     timing.DvlTimeOffset,
     timing.ReferenceTimeOffset,
     timing.AttitudeTimeOffset,
@@ -35,8 +36,8 @@ OWN: tuple[type[AnyEffect], ...] = (
     sensor.AxisNonorthogonality,
     environment.HeadingError,
     environment.WaterLock,
-    kinematic.Sideslip,
-    kinematic.TiltCoupling,
+    sensor.Sideslip,
+    sensor.TiltCoupling,
     sensor.MountingMoved,
     sensor.SoundSpeedMoved,
     noise.Outliers,
@@ -48,7 +49,7 @@ OWN: tuple[type[AnyEffect], ...] = (
 E = TypeVar("E", bound=AnyEffect)
 
 
-class Registry(Mapping[str, E], Generic[E]):
+class Registry(UserDict[str, E]):
     """Mapping from name to the only instance of each effect of a kind, own ones first.
 
     Entry points are read at the first use.
@@ -58,17 +59,9 @@ class Registry(Mapping[str, E], Generic[E]):
         self._kind = kind
 
     @cached_property
-    def _effects(self) -> dict[str, E]:
+    def data(self) -> dict[str, E]:  # type: ignore[override]  # an attribute of UserDict
+        """All effects of the kind."""
         return {effect.name: effect for effect in all_effects() if isinstance(effect, self._kind)}
-
-    def __getitem__(self, name: str) -> E:
-        return self._effects[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._effects)
-
-    def __len__(self) -> int:
-        return len(self._effects)
 
 
 @lru_cache(maxsize=1)

@@ -1,4 +1,4 @@
-"""Effects within the DVL and its mounting."""
+"""Effects of the DVL, of its mounting and of the vehicle's motion."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.numerics.frames import Array
+from ..calibration.numerics.frames import Array, cross
 from .base import (
     HOUR_S,
     ActsOn,
@@ -17,6 +17,7 @@ from .base import (
     MountingEffect,
     along_axes,
     vector,
+    within,
 )
 
 
@@ -46,9 +47,7 @@ class QuadraticScale(Effect):
     remedy = "ask the DVL's maker; drive the survey at the speed that was calibrated"
     manoeuvre = "straight legs at three speeds or more"
     parameters = (
-        EffectParameter(
-            "coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed", said="coefficient"
-        ),
+        within("coefficient_s_per_m", "s/m", 0.005, 0.2, "scale-factor error per m/s of speed", "coefficient"),
     )
     acts_on = ActsOn.DVL
     confounded_with = ("velocity_bias",)
@@ -65,11 +64,7 @@ class ScaleDrift(Effect):
     summary = "the scale-factor error changes along the run, as of sound speed: rate · (t - start) · v"
     remedy = "measure the speed of sound along the run, or give the DVL temperature and salinity"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
-    parameters = (
-        EffectParameter(
-            "rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour", said="rate"
-        ),
-    )
+    parameters = (within("rate_per_hour", "1/h", 0.03, 2.0, "change of the scale-factor error per hour", "rate"),)
     per_recording = True
     acts_on = ActsOn.DVL
     confounded_with = ("misalignment_drift", "sound_speed_layer")
@@ -86,11 +81,7 @@ class SoundSpeedLayer(Effect):
     summary = "the scale-factor error changes with depth, as sound speed does in layers: ratio · (depth - start) · v"
     remedy = "let the DVL compute the speed of sound at its depth, from temperature and salinity"
     manoeuvre = "the same straight leg at three depths, the first one again at the end"
-    parameters = (
-        EffectParameter(
-            "ratio_per_m", "1/m", 0.0005, -0.05, 0.05, "scale-factor error per metre below the start", said=""
-        ),
-    )
+    parameters = (within("ratio_per_m", "1/m", 0.0005, 0.05, "scale-factor error per metre below the start", ""),)
     acts_on = ActsOn.DVL
     needs = frozenset({EffectNeeds.DEPTH})
     confounded_with = ("scale_drift",)
@@ -168,6 +159,9 @@ class SoundSpeedMoved(Effect):
         return values["ratio"] * motion.velocity_body
 
 
+_SHEAR = "half of the difference between 90° and the angle of {} and {}"
+
+
 class AxisNonorthogonality(Effect):
     """Axes that are not orthogonal, for example by wrong beam directions.
 
@@ -179,16 +173,7 @@ class AxisNonorthogonality(Effect):
     remedy = "ask the DVL's maker: its beam directions differ from the specification"
     manoeuvre = "sway and heave in addition to surge: drift across, dive or drive in waves"
     parameters = tuple(
-        EffectParameter(
-            f"{axes}_rad",
-            "rad",
-            0.01,
-            -0.3,
-            0.3,
-            f"half of the difference between 90° and the angle of {axes[0]} and {axes[1]}",
-            said=axes,
-        )
-        for axes in ("xy", "xz", "yz")
+        within(f"{a}{b}_rad", "rad", 0.01, 0.3, _SHEAR.format(a, b), f"{a}{b}") for a, b in ("xy", "xz", "yz")
     )
     acts_on = ActsOn.DVL
     confounded_with = ("sideslip", "lever_arm")
@@ -198,3 +183,74 @@ class AxisNonorthogonality(Effect):
         xy, xz, yz = (values[parameter.name] for parameter in self.parameters)
         shear = np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
         return motion.velocity_dvl @ shear @ motion.rotation_dvl_from_body
+
+
+class LeverArm(Effect):
+    """Velocity ω×l, because the DVL is not at the reference velocity's point."""
+
+    name = "lever_arm"
+    summary = "the DVL sits at l from the reference point and moves when the vehicle turns: ω × l"
+    remedy = "--apply writes the lever arm; measure it with a tape to be sure"
+    manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
+    parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
+    acts_on = ActsOn.MOTION
+    needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
+    of_velocity = False
+    confounded_with = ("sideslip", "reference_time_offset", "reference_lag")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Return ω × l."""
+        return cross(motion.turn_rate, vector(values, "m"))
+
+
+class Sideslip(Effect):
+    """Sway in a turn that the DVL measures and the reference does not, for example one derived from course."""
+
+    name = "sideslip"
+    summary = "sway that only the DVL sees: coefficient · ω_z · horizontal speed"
+    remedy = (
+        "the DVL sees another sway than the reference: look for what moves the water at it (thrusters, its fairing)"
+    )
+    manoeuvre = "turns to both sides at two speeds (a lever arm does not grow with speed)"
+    parameters = (
+        within("coefficient_s", "s", 0.1, 10.0, "sway per turn rate and speed; negative: outward", "coefficient"),
+    )
+    acts_on = ActsOn.MOTION
+    needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
+    confounded_with = ("lever_arm", "reference_time_offset", "reference_lag")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Return (0, coefficient · ω_z · speed, 0)."""
+        sway = values["coefficient_s"] * motion.turn_rate[:, 2] * np.hypot(*motion.velocity_body[:, :2].T)
+        return sway[:, None] * [0.0, 1.0, 0.0]
+
+
+class TiltCoupling(Effect):
+    """Velocity error proportional to the tilt of the vehicle."""
+
+    name = "tilt_coupling"
+    summary = "an error in proportion to pitch or roll, body frame"
+    remedy = "the velocity of DVL or reference is not rotated by the vehicle's roll and pitch: check the driver's frame"
+    manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
+    parameters = (
+        within("x_per_pitch", "m/s/rad", 0.5, 20.0, "surge error per pitch (positive: bow down)", "x per pitch"),
+        within("z_per_pitch", "m/s/rad", 0.5, 20.0, "heave error per pitch", "z per pitch"),
+        within("y_per_roll", "m/s/rad", 0.5, 20.0, "sway error per roll (positive: port side up)", "y per roll"),
+        within("z_per_roll", "m/s/rad", 0.5, 20.0, "heave error per roll", "z per roll"),
+    )
+    acts_on = ActsOn.DVL
+    of_velocity = False
+    needs = frozenset({EffectNeeds.ATTITUDE})
+    confounded_with = ("velocity_bias", "lever_arm")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Return gains (3, 2) times pitch and roll."""
+        rotation = motion.attitude
+        pitch = -np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0))
+        roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
+        gains = [
+            [values["x_per_pitch"], 0.0],
+            [0.0, values["y_per_roll"]],
+            [values["z_per_pitch"], values["z_per_roll"]],
+        ]
+        return np.column_stack([pitch, roll]) @ np.transpose(gains)

@@ -13,14 +13,24 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.delay_search import FARTHEST_S
-from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory, recursion, slopes
+from .base import (
+    ActsOn,
+    ClockEffect,
+    EffectInput,
+    EffectNeeds,
+    EffectParameter,
+    EffectWithMemory,
+    recursion,
+    slopes,
+    within,
+)
 
 # search range of the clock registration
 LONGEST_OFFSET_S = FARTHEST_S
 
 
 def _seconds(what: str) -> tuple[EffectParameter]:
-    return (EffectParameter("seconds", "s", 0.1, -LONGEST_OFFSET_S, LONGEST_OFFSET_S, what, linear=False, said=""),)
+    return (within("seconds", "s", 0.1, LONGEST_OFFSET_S, what, "", linear=False),)
 
 
 class _DvlClock(ClockEffect):
@@ -76,11 +86,7 @@ class ClockDrift(_DvlClock):
     summary = "the DVL's clock runs fast: its stamps get later by seconds_per_hour"
     remedy = "--apply writes dvl_clock_drift; better, discipline the DVL's clock (PTP, PPS)"
     manoeuvre = "turns and changes of speed at the beginning, in the middle and at the end"
-    parameters = (
-        EffectParameter(
-            "seconds_per_hour", "s/h", 1.0, -36.0, 36.0, "how much later stamps get", linear=False, said=""
-        ),
-    )
+    parameters = (within("seconds_per_hour", "s/h", 1.0, 36.0, "how much later stamps get", "", linear=False),)
     confounded_with = ("dvl_time_offset", "time_offset_jump")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:

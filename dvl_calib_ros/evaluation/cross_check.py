@@ -30,8 +30,7 @@ from ..recordings.recording import hold_the_same, open_recording
 from ..recordings.topic_messages import Recorded
 from ..verdict.answering import Answering
 from ..version import __version__
-from .metrics import RunMoments, vrmse
-from .results import Failure, Improvement
+from .results import Failure, Improvement, RunMoments, vrmse
 
 
 @dataclass(frozen=True, repr=False)

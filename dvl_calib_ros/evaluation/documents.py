@@ -11,9 +11,9 @@ import numpy as np
 
 from ..calibration.numerics.frames import Array
 from ..errors import as_cell
-from .convergence import curves_document
 from .protocol import MANOEUVRING
 from .results import Coverage, EachStudy, Evaluation
+from .validation_study import curves_document
 
 CSV_COLUMNS = ("study", "set", "calibrated_on", "from_s", "to_s", "model", "seed", "avg_vrmse_mps", "published_mps")
 

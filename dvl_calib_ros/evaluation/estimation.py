@@ -9,7 +9,7 @@ Shapes: B variants of a run, N samples, E calibration times, n states.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import TypeVar
 
@@ -217,14 +217,8 @@ def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
         same_for_all = values.shape[1] == 1
         return values if same_for_all else values.reshape(*usable.shape, *values.shape[2:])
 
-    return kalman.Measurements(
-        z=split(flat.z),
-        h=split(flat.h),
-        r=split(flat.r),
-        weight=split(flat.weight),
-        usable=split(flat.usable) & usable,
-        gate=split(flat.gate),
-    )
+    by_variant = {field.name: split(getattr(flat, field.name)) for field in fields(flat)}
+    return kalman.Measurements(**by_variant | {"usable": by_variant["usable"] & usable})
 
 
 def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> GaussianState:

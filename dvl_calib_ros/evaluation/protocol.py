@@ -14,7 +14,7 @@ licence, so users download them, and this project does not include them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import product
 from pathlib import Path
@@ -27,7 +27,7 @@ from ..calibration.numerics.frames import FLU_FROM_FRD, Array, attitude_enu_flu_
 from ..errors import InputError
 from ..logs.dvl_log import angular_velocities
 from ..logs.trajectories import read_columns
-from ..simulation.sensors import DvlErrors, equivalent_error_terms, measure_dvl, measure_gnss
+from ..simulation.sensors import DvlErrors, equivalent_error_terms
 from ..simulation.trajectories import make_motion
 from .results import UNCALIBRATED, CalibrationSet
 
@@ -81,16 +81,6 @@ def truth() -> Array:
     return np.array([[*FLU_FROM_FRD @ misalignment, *scale] for misalignment, scale in pairs])
 
 
-def unit_under_test(velocity_flu: Array, errors: DvlErrors, rng: np.random.Generator) -> Array:
-    """Simulate a DVL with these errors (N, 3) m/s from a velocity over ground, both forward-left-up."""
-    return measure_dvl(velocity_flu @ FLU_FROM_FRD, errors, np.eye(3), rng) @ FLU_FROM_FRD
-
-
-def reference(velocity_flu: Array, rng: np.random.Generator, gnss_std: float = GNSS_STD) -> Array:
-    """Simulate GNSS (N, 3) m/s from a velocity over ground, body frame."""
-    return measure_gnss(velocity_flu, gnss_std, rng)
-
-
 def random_stream(sensor: str, seed: int, trajectory: str, combination: int) -> np.random.Generator:
     """Return the generator of one sensor's noise.
 
@@ -141,14 +131,9 @@ class Trajectory:
 
     def part(self, start: int, end: int) -> Trajectory:
         """Return the samples start .. end - 1."""
-        rotation, rates = self.rotation_enu_from_body, self.angular_velocity
-        return Trajectory(
-            self.name,
-            self.time[start:end],
-            self.velocity[start:end],
-            None if rotation is None else rotation[start:end],
-            None if rates is None else rates[start:end],
-        )
+        columns = ("time", "velocity", "rotation_enu_from_body", "angular_velocity")
+        given = ((name, getattr(self, name)) for name in columns)
+        return replace(self, **{name: values[start:end] for name, values in given if values is not None})
 
 
 def load_folder(folder: Path, partial: bool = False) -> tuple[dict[str, Trajectory], tuple[str, ...]]:

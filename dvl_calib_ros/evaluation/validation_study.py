@@ -1,6 +1,7 @@
-"""The published procedure over many noise seeds, with hold-out verdicts.
+"""The published procedure over many noise seeds, with hold-out verdicts and convergence of the misalignment.
 
-Shapes: B combinations of errors, E calibration times, C columns: the uncalibrated DVL and the models.
+Shapes: B combinations of errors, N samples, E calibration times, T points of time, C columns: the uncalibrated DVL and
+the models.
 """
 
 from __future__ import annotations
@@ -13,24 +14,120 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.observability import OBSERVED_SHARE
 from ..calibration.models import BY_VELOCITY, MODELS, Model
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.numerics.error_model import correction_matrix
-from ..calibration.numerics.frames import Array
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.results import Result, Verification
 from ..errors import InputError
 from ..parallel import Workers, run_all
+from ..simulation.sensors import measure_dvl, measure_gnss
 from ..version import __version__
 from . import protocol
-from .convergence import REFERENCE_STD, TIMES_S, curve_keys, curves, squared_errors
 from .estimation import SensorData, estimate, streams_of, true_prior
-from .metrics import BASELINES, RunMoments, coverage, heading_spread, vrmse
 from .protocol import SCALES_PERCENT, Trajectory, load_folder, own_trajectories
-from .results import CalibrationRun, CalibrationSet, Coverage, EachStudy, Evaluation, Failure, HeldOut, mean_of_known
+from .results import (
+    BASELINES,
+    CalibrationRun,
+    CalibrationSet,
+    ConvergenceCurve,
+    Coverage,
+    EachStudy,
+    Evaluation,
+    Failure,
+    HeldOut,
+    RunMoments,
+    coverage,
+    heading_spread,
+    mean_of_known,
+    vrmse,
+)
+
+TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
+# noise of the reference, m/s per axis: the procedure's, and a good receiver's
+REFERENCE_STD = (protocol.GNSS_STD, 0.02)
+# result reported for a published network that aligns a DVL: error in degrees after a time in s
+PUBLISHED_DEG, PUBLISHED_S = 0.8, 25.0
+_AIDED, _FREE = ("M3",), ("unaided", "M7")
+
+
+def curve_keys(models: Sequence[str]) -> list[tuple[str, float | None]]:
+    """Return names and noise levels of the curves for these models."""
+    aided = [*(name for name in _AIDED if name in models), *BASELINES]
+    keys: list[tuple[str, float | None]] = [(name, std) for std in REFERENCE_STD for name in aided]
+    return keys + [(name, None) for name in _FREE if name in models]
+
+
+def squared_errors(
+    run: Trajectory,
+    measured: Array,
+    references: Mapping[float, Array],
+    models: Sequence[str],
+    parameters: Parameters,
+    failures: list[Failure],
+) -> Array:
+    """Return squared errors of φ on one run (curves, T, 3) rad², averaged over combinations; nan for unusable models.
+
+    measured: (B, N, 3) m/s.
+    references: noise -> (B, N, 3) m/s.
+    failures: receives exceptions.
+    """
+    ends = [run.first(seconds) for seconds in TIMES_S]
+    truth = protocol.truth()[:, :3]
+    by_key: dict[tuple[str, float | None], Array] = {}
+    for std, reference in references.items():
+        data = SensorData(run, measured, reference).part(0, ends[-1])
+        aided = [name for name in _AIDED if name in models]
+        free = [name for name in _FREE if name in models] if std == REFERENCE_STD[0] else []
+        states = estimate([*aided, *free], data, parameters.replace(gnss_aided_std=std), ends, failures)
+        for name, state in states.items():
+            by_key[name, None if name in free else std] = mean_of_known((state.x[..., :3] - truth) ** 2, 1)
+        for name, rotations in _baselines(data, ends, failures).items():
+            if np.isfinite(rotations).all():  # else only this curve's share of the run is lost
+                by_key[name, std] = np.mean([_rotation_errors(each, truth) ** 2 for each in rotations], axis=1)
+    missing = np.full((len(TIMES_S), 3), np.nan)
+    return np.stack([by_key.get(key, missing) for key in curve_keys(models)])
+
+
+def _rotation_errors(body_from_dvl: Array, misalignment: Array) -> Array:
+    """Return rotation vectors (B, 3) rad from the rotation of a misalignment φ (B, 3) to rotations (B, 3, 3)."""
+    norm = np.linalg.norm(misalignment, axis=-1, keepdims=True)
+    truth = Rotation.from_rotvec(misalignment / norm * np.arctan(norm))  # see `error_model.corrected_mounting`
+    found = Rotation.from_matrix(np.swapaxes(body_from_dvl, -1, -2))
+    return np.asarray((found * truth.inv()).as_rotvec())
+
+
+def curves(models: Sequence[str], squares: Array) -> tuple[ConvergenceCurve, ...]:
+    """Average squared errors (..., curves, T, 3) rad² over seeds and runs; nan if a curve cannot run."""
+    mean = mean_of_known(squares, tuple(range(squares.ndim - 3)))
+    return tuple(
+        ConvergenceCurve(name, std, np.sqrt(each))
+        for (name, std), each in zip(curve_keys(models), mean, strict=True)
+        if np.isfinite(each).all()
+    )
+
+
+def curves_document(found: Sequence[ConvergenceCurve]) -> dict[str, Any]:
+    """Return the curves as plain data for JSON, in degrees."""
+    return {
+        "times_s": list(TIMES_S),
+        "published": {"seconds": PUBLISHED_S, "degrees": PUBLISHED_DEG},
+        "curves": [
+            {
+                "name": each.name,
+                "gnss_std": each.gnss_std,
+                "angle_deg": each.angle_deg.tolist(),
+                "pitch_and_yaw_deg": each.level_deg.tolist(),
+            }
+            for each in found
+        ],
+    }
+
 
 # One noise seed of the published procedure and of the studies around it.
 
@@ -118,10 +215,10 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     baselines = np.array(
         [
             [
-                float(vrmse(_moments_of_others(moments, each.calibration_run), matrices).mean())
-                for matrices in _baselines(data(each.calibration_run), each.window_s, failures)
+                float(vrmse(_moments_of_others(moments, each.calibration_run), rotations[0]).mean())
+                for rotations in _baselines(stretch, [stretch.run.first(each.window_s)], failures).values()
             ]
-            for each in procedure.sets
+            for each, stretch in ((each, data(each.calibration_run)) for each in procedure.sets)
         ]
     )
     if not procedure.studies:
@@ -162,16 +259,16 @@ def _moments_of_others(moments: Mapping[str, RunMoments], name: str) -> RunMomen
     return RunMoments.stack([each for other, each in moments.items() if other != name])
 
 
-def _baselines(data: SensorData, window_s: float | None, failures: list[Failure]) -> list[Array]:
-    """Return corrections (B, 3, 3) by each baseline; nan if it raises."""
-    end = data.run.first(window_s)
-    found = []
+def _baselines(data: SensorData, ends: Sequence[int], failures: list[Failure]) -> dict[str, Array]:
+    """Return rotations (E, B, 3, 3) by each baseline after the first `ends` samples; nan if it raises."""
+    found: dict[str, Array] = {}
     for name, align in BASELINES.items():
         try:
-            found.append(align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]))
+            parts = ((data.run.time[:n], data.velocity_dvl[:, :n], data.reference[:, :n]) for n in ends)
+            found[name] = np.stack([align(*part) for part in parts])
         except Exception as error:
             failures.append(Failure.of(error, name, data.run.name))
-            found.append(np.full((len(data.velocity_dvl), 3, 3), np.nan))
+            found[name] = np.full((len(ends), len(data.velocity_dvl), 3, 3), np.nan)
     return found
 
 
@@ -182,9 +279,10 @@ def sensor_data(run: Trajectory, seed: int) -> SensorData:
 
 def dvl_velocities(run: Trajectory, seed: int) -> Array:
     """Simulate DVL velocities (B, N, 3) m/s with every combination of errors."""
+    of_dvl = run.velocity @ FLU_FROM_FRD
     return np.stack(
         [
-            protocol.unit_under_test(run.velocity, errors, protocol.random_stream("dvl", seed, run.name, index))
+            measure_dvl(of_dvl, errors, np.eye(3), protocol.random_stream("dvl", seed, run.name, index)) @ FLU_FROM_FRD
             for index, errors in enumerate(protocol.COMBINATIONS)
         ]
     )
@@ -194,7 +292,7 @@ def references(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) 
     """Simulate a GNSS velocity (B, N, 3) m/s, with noise of its own for each combination of misalignment and scale."""
     return np.stack(
         [
-            protocol.reference(run.velocity, protocol.random_stream("gnss", seed, run.name, index), gnss_std)
+            measure_gnss(run.velocity, gnss_std, protocol.random_stream("gnss", seed, run.name, index))
             for index in range(len(protocol.COMBINATIONS))
         ]
     )
@@ -463,8 +561,6 @@ def _summary(set_name: str, model: str, found: Sequence[Verification]) -> HeldOu
         set_name=set_name,
         model=model,
         verdict=verdicts.most_common(1)[0][0],
-        uncorrected=rms("uncorrected"),
-        corrected=rms("corrected"),
-        predicted=rms("predicted"),
+        **{kind: rms(kind) for kind in ("uncorrected", "corrected", "predicted")},
         verdicts=dict(verdicts),
     )

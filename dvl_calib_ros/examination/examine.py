@@ -29,8 +29,7 @@ from ..messages.decode import turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S
 from ..recordings.recording import Recording, open_recording
-from ..recordings.topic_messages import Recorded
-from ..recordings.topic_preview import Preview
+from ..recordings.topic_messages import Preview, Recorded
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding, full, is_cause

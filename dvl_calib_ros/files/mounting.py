@@ -18,7 +18,7 @@ from ..calibration.filters.observability import Convergence, observability
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameters import FRD, ParameterError, Parameters
 from ..calibration.numerics.error_model import corrected_mounting
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of, rejection
 from ..calibration.results.results import lever_arm, position_in_body, scale_and_delay
@@ -213,9 +213,7 @@ def _unobservable_angles(model: Model, state: GaussianState, parameters: Paramet
 
 def angle_between(a: Array, b: Array) -> float:
     """Return the angle between two rotations (3, 3), rad; exact for small ones."""
-    between = a.T @ b
-    sine = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])
-    return math.atan2(0.5 * float(np.linalg.norm(sine)), 0.5 * (float(np.trace(between)) - 1.0))
+    return float(np.linalg.norm(turn_between(a, b)))
 
 
 def calibrated_urdf(

@@ -74,7 +74,7 @@ class _Written:
         return os.path.isdir(real) and any(self._is_in(place, real) for place in self.places[:1])
 
     def _is_in(self, place: str, folder: str) -> bool:
-        if _identity(folder) not in {_identity(above) for above in _parents(place)}:
+        if _identity(folder) not in set(map(_identity, Path(place).parents)):
             return False
         return not self.is_folder or os.path.lexists(place) or _is_recording(folder)
 
@@ -88,7 +88,9 @@ class _Written:
             return True
         if not mine or not others:
             return False
-        above_mine, above_others = (set(map(_entry, map(_folded, _parents(one.places[0])))) for one in (self, other))
+        above_mine, above_others = (
+            {_entry(_folded(str(above))) for above in Path(one.places[0]).parents} for one in (self, other)
+        )
         return mine[0] in above_others or others[0] in above_mine
 
 
@@ -106,14 +108,7 @@ def _folded(path: str) -> str:
     return os.path.join(folder, unicodedata.normalize("NFC", name).casefold())
 
 
-def _parents(path: str) -> Iterator[str]:
-    """Yield the folders above a path, the nearest first."""
-    while (folder := os.path.dirname(path)) != path:
-        yield folder
-        path = folder
-
-
-def _identity(path: str) -> _Identity | None:
+def _identity(path: str | Path) -> _Identity | None:
     """Return device and inode of a path; None if it does not exist."""
     with suppress(OSError, ValueError):
         found = os.stat(path)

@@ -223,8 +223,7 @@ def parameter_file_text() -> str:
         about = "; ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
         lines.append(f"    # {spec.description}" + (f" [{about}]" if about else ""))
         value = list(spec.default) if isinstance(spec.default, tuple) else spec.default
-        text = yaml.safe_dump(value, default_flow_style=True).removesuffix("...\n").strip()
-        lines.append(f"    {name}: {text}")
+        lines.append(f"    {name}: {as_yaml(value)}")
     return "\n".join(lines) + "\n"
 
 

@@ -373,12 +373,8 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
     """
     content, known = load_result(path, of_recording=True)
     _check_mounting(path, content, mounting_rpy)
-    return {name: _for_another_recording(name, state) for name, state in known.items()}
-
-
-def _for_another_recording(name: str, state: GaussianState) -> GaussianState:
-    model = MODELS[name]
-    return with_states_of(state, prior(model, Parameters()), model.not_handed_on)
+    start = {name: (MODELS[name].not_handed_on, prior(MODELS[name], Parameters())) for name in known}
+    return {name: with_states_of(state, start[name][1], start[name][0]) for name, state in known.items()}
 
 
 def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any], dict[str, GaussianState]]:

@@ -22,7 +22,6 @@ from ..bag_replay.replay import Replayed, extrinsics_of_replay, memory_given_bac
 from ..bags.files import STORAGE_SUFFIXES, storage_suffix
 from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
-from ..calibration.results.extrinsics import Extrinsics
 from ..calibration.results.mounting_quantities import LATE, quantities
 from ..calibration.results.results import Estimate, Result
 from ..discovery.discover import discover
@@ -331,7 +330,8 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
     extrinsics, without_day = (extrinsics_of_replay(variant, where) for variant in (replayed, _without_day(replayed)))
     extrinsics_row = None
     if extrinsics is not None and without_day is not None:
-        extrinsics_row = {**_plain_data(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
+        values = asdict(extrinsics) | {"covariance_of_recording": without_day.covariance}
+        extrinsics_row = {n: each.tolist() if isinstance(each, np.ndarray) else each for n, each in values.items()}
         if replayed.cause_of_scale is not None:
             extrinsics_row["cause_of_scale"] = replayed.cause_of_scale.sentence
     rows = (*_quantities(result), *_heading(estimate), *_water(replayed.water))
@@ -405,9 +405,3 @@ def _without_day(replayed: Replayed) -> Replayed:
     """Return the replay with σ of this recording only, without the variation between days."""
     parameters = {**replayed.result.parameters, **dict.fromkeys(_DAY, 0.0)}
     return replace(replayed, result=replace(replayed.result, parameters=parameters))
-
-
-def _plain_data(extrinsics: Extrinsics) -> dict[str, Any]:
-    return {
-        name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(extrinsics).items()
-    }

@@ -1,14 +1,16 @@
-"""Logs of DVLs in the instruments' own formats: Water Linked's JSON reports and Teledyne RDI's PD0 ensembles.
+"""Logs of DVLs in the instruments' own formats: Water Linked's JSON reports, RDI's PD0 ensembles, Nortek's records.
 
-`nortek_logs` has Nortek's, `text_logs` the text formats, and `ardupilot_logs` those of ArduPilot, which have DVL, GNSS
-and attitude of one vehicle.
+`text_logs` has the text formats, and `ardupilot_logs` the logs of ArduPilot, which have DVL, GNSS and attitude of one
+vehicle.
 
 Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
 time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
 PD0 (x starboard, y forward, z up). It is the bottom's motion relative to the DVL, so its sign is inverted. Velocities
 are returned in instrument axes (y along beam 3): beam velocities are converted, ship and earth axes rotated back. By
 default the attitude comes from the DVL's own sensors. EA is the angle of beam 3 clockwise from the ship's centre line,
-and headings are the ship's (same document, EA): EA is the nominal yaw.
+and headings are the ship's (same document, EA): EA is the nominal yaw. Nortek (DVL 300 to 1000; .ad2cp or captured
+from a port; "DVL Integrator's Guide"): bottom track of data format 21, records with the ID 1Bh, X forward, Y starboard,
+Z down, m/s, stamped at the trigger; the bottom echo comes the time DT1 later. Two pairs of beams measure Z separately.
 """
 
 from __future__ import annotations
@@ -31,9 +33,94 @@ from ..errors import InputError
 from ..messages.encode import WaterReading
 from .ardupilot_logs import is_dataflash, is_telemetry, read_ardupilot_log
 from .dvl_log import DvlLog, imu_samples
-from .nortek_logs import is_nortek_log, read_nortek_log
-from .pd0_nmea import GENERAL_NMEA, Nmea
-from .text_logs import is_pd6, is_sentences, read_pd6, read_sentences
+from .text_logs import GENERAL_NMEA, Nmea, is_pd6, is_sentences, read_pd6, read_sentences
+
+_SYNC, _NORTEK_BOTTOM_TRACK = 0xA5, 0x1B
+# sync, size of the header, ID, family, size of the data, its checksum, the header's own
+_HEADER = struct.Struct("<BBBBHHH")
+_CHECKSUM_START = 0xB58C
+# version, offset of data, serial, date and time, 100 µs, beams, error, status, sound speed, temperature, pressure
+_LEADER = struct.Struct("<BBI6BHHII3f")
+# six quantities by beam; then X, Y, Z1, Z2 of velocity, figure of merit, DT1
+_BY_BEAM, _BY_AXIS = struct.Struct("<24f"), struct.Struct("<12f")
+# status bits for valid velocities of X, Y, Z1, Z2
+_VALID = (1 << 12, 1 << 13, 1 << 14, 1 << 15)
+# a velocity that was not measured, m/s; upper limit of DT1, s
+_NORTEK_BAD_VELOCITY, _LONGEST_DT_S = -32.0, 1.0
+
+
+def is_nortek_log(start: bytes) -> bool:
+    """Return whether a record of bottom track begins in the first bytes of a file."""
+    return any(True for _ in _records(start))
+
+
+def _read_nortek(_path: Path, content: bytes) -> DvlLog:
+    """Read Nortek's records."""
+    samples: list[DvlSample] = []
+    waters: list[WaterReading] = []
+    left_out: Counter[str] = Counter()
+    for data in _records(content):
+        try:
+            sample = _sample(data)
+        except (struct.error, ValueError, OverflowError):
+            left_out["damaged"] += 1
+            continue
+        if sample is None:
+            left_out["without bottom lock"] += 1
+        else:
+            samples.append(sample)
+            used, temperature = _LEADER.unpack_from(data)[-3:-1]
+            waters.append(WaterReading(sample.stamp_ns, used, temperature, math.nan))
+    return DvlLog(samples, left_out, waters=waters)
+
+
+def _records(content: bytes) -> Iterator[bytes]:
+    """Yield the data of each bottom-track record with a sound header; nothing of it if damaged or cut off."""
+    start = 0
+    while (at := content.find(_SYNC, start)) >= 0:
+        start = at + 1
+        if at + _HEADER.size > len(content):
+            return
+        _, size, identity, _, length, checksum, own = _HEADER.unpack_from(content, at)
+        if size != _HEADER.size or _sum(content[at : at + size - 2]) != own:
+            continue
+        data = content[at + size : at + size + length]
+        if len(data) < length or _sum(data) != checksum:
+            if identity == _NORTEK_BOTTOM_TRACK:
+                yield b""
+            continue
+        start = at + size + length
+        if identity == _NORTEK_BOTTOM_TRACK:
+            yield data
+
+
+def _sum(data: bytes) -> int:
+    """Return Nortek's checksum: the sum of 16-bit words, modulo 2^16; an odd last byte is the high byte of a word."""
+    even = data[: len(data) & ~1]
+    total = _CHECKSUM_START + sum(struct.unpack(f"<{len(even) // 2}H", even))
+    return (total + (data[-1] << 8 if len(data) % 2 else 0)) & 0xFFFF
+
+
+def _sample(data: bytes) -> DvlSample | None:
+    """Return a record's velocity, with the mean of its valid vertical velocities; None without bottom lock."""
+    _, _, _, year, month, day, hour, minute, second, fraction, _, _, status, *_ = _LEADER.unpack_from(data)
+    values = np.array(_BY_AXIS.unpack_from(data, _LEADER.size + _BY_BEAM.size), dtype=float).reshape(3, 4)
+    velocity, noise, delay = values
+    valid = np.array([bool(status & bit) for bit in _VALID]) & np.isfinite(velocity) & (velocity > _NORTEK_BAD_VELOCITY)
+    if not (valid[0] and valid[1] and valid[2:].any()):
+        return None
+    # as in C's struct tm: years since 1900, months from 0
+    whole_second = datetime(1900 + year, month + 1, day, hour, minute, second, tzinfo=timezone.utc)
+    dt = float(delay[:2].mean())
+    stamp_ns = int(whole_second.timestamp()) * 1_000_000_000 + fraction * 100_000
+    stamp_ns += round(1e9 * dt) if 0.0 <= dt < _LONGEST_DT_S else 0
+    weights = valid[2:] / valid[2:].sum()
+    vertical = float(np.where(valid[2:], velocity[2:], 0.0) @ weights)
+    stds = [*noise[:2].tolist(), float(np.where(valid[2:], noise[2:], 0.0) @ weights)]
+    covariance = np.diag(np.square(stds)) if all(math.isfinite(std) and std > 0.0 for std in stds) else None
+    x, y, z = (FLU_FROM_FRD @ [velocity[0], velocity[1], vertical] + 0.0).tolist()
+    return DvlSample(stamp_ns, (x, y, z), covariance)
+
 
 PD0_START = b"\x7f\x7f"
 # number of bytes that identify a file's kind
@@ -83,11 +170,6 @@ def read_dvl_log(path: Path) -> DvlLog:
     in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda one: one.stamp_ns)
     log.left_out["of a time that was there already"] += len(log.samples) - len(in_order)
     return log._replace(samples=in_order, left_out=+log.left_out)
-
-
-def _read_nortek(_: Path, content: bytes) -> DvlLog:
-    samples, left_out, waters = read_nortek_log(content)
-    return DvlLog(samples, left_out, waters=waters)
 
 
 def _holds_json(content: bytes) -> bool:
@@ -327,18 +409,10 @@ def _applied_rotation(roll: float, pitch: float, heading: float, fixed: bytes) -
     fixed: fixed leader. (Same document, eq. 18.) The transpose undoes the rotation exactly, even if the heading is
     inaccurate.
     """
-    if not fixed[25] & 4:
-        roll = pitch = 0.0
-    sh, ch, sp, cp, sr, cr = (
-        math.sin(heading), math.cos(heading), math.sin(pitch), math.cos(pitch), math.sin(roll), math.cos(roll),
-    )  # fmt: skip
-    return np.array(
-        [
-            [ch * cr + sh * sp * sr, sh * cp, ch * sr - sh * sp * cr],
-            [-sh * cr + ch * sp * sr, ch * cp, -sh * sr - ch * sp * cr],
-            [-cp * sr, sp, cp * cr],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    tilts = [pitch, roll] if fixed[25] & 4 else [0.0, 0.0]
+    return np.asarray(Rotation.from_euler("ZXY", [-heading, *tilts]).as_matrix())
 
 
 # content kinds: test and reader; the first that matches is used

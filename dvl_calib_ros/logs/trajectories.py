@@ -27,7 +27,7 @@ from ..errors import InputError
 from ..messages.encode import SampleWriter, SatelliteFix
 from .dvl_log import DvlLog, imu_samples
 from .dvl_logs import is_dvl_log, read_dvl_log
-from .pd0_nmea import KNOT, is_nmea, read_rmc
+from .text_logs import KNOT, is_nmea, read_rmc
 
 # Columns of numbers and stamps in CSV files.
 

@@ -113,6 +113,20 @@ def frame_named(frame_id: str, base_frames: Collection[str]) -> DeclaredFrame | 
     return None if suffix is None else DECLARED_FRAMES[suffix]
 
 
+def declared_frame(
+    kind: VelocityType, frame_id: str, parameters: Parameters, base_frame: str = ""
+) -> DeclaredFrame | None:
+    """Return the frame that a reference declares, by parameter, type or frame_id; None if unknown.
+
+    base_frame: another name of the body.
+    """
+    if parameters.gnss_frame != FROM_FRAME_ID:
+        return DECLARED_FRAMES[parameters.gnss_frame]
+    if kind.reference_frame is not None:
+        return DeclaredFrame(kind.reference_frame)
+    return frame_named(frame_id, (parameters.base_frame, base_frame or parameters.base_frame))
+
+
 def heading_variance(covariance: Any) -> float:
     """Return the variance of an IMU's orientation about z, rad², from its covariance (9,); nan if not given."""
     given = covariance[0] != NO_DATA and covariance[8] > 0.0
@@ -355,16 +369,11 @@ class MessageDecoder:
 
     def _frame_named(self, frame_id: str) -> DeclaredFrame | None:
         """Return the reference's frame, by parameter, type or frame_id; None, with a note, if unknown."""
-        p = self.parameters
-        if p.gnss_frame != FROM_FRAME_ID:
-            return DECLARED_FRAMES[p.gnss_frame].in_base(p.base_axes)
-        if self.reference_type.reference_frame is not None:
-            return DeclaredFrame(self.reference_type.reference_frame)
-        frame = frame_named(frame_id, (p.base_frame,))
+        frame, base = declared_frame(self.reference_type, frame_id, self.parameters), self.parameters.base_frame
         if frame is None:
-            self._report("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, base=p.base_frame))
+            self._report("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, base=base))
             return None
-        return frame.in_base(p.base_axes)
+        return frame.in_base(self.parameters.base_axes)
 
     def note_imu_frame(self, frame_id: str) -> None:
         """Note the frame of IMU messages."""

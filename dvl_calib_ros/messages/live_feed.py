@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -101,15 +102,11 @@ class MessageFeed:
 
 # largest number of kept messages, 140 bytes each: an IMU at 100 Hz for a quarter of an hour
 MOST = 100_000
-_NOT_GIVEN = (float("nan"),) * 4
 _CODES = {stream: code for code, stream in enumerate(Stream)}
 
 
-class KeptMessages(RowTable):
-    """All messages so far in order of arrival, or none after more than `MOST`. is_kept: whether it has them.
-
-    The memory is allocated at the start, so that a node's memory does not grow with the messages received.
-    """
+class DecodedMessages(RowTable):
+    """Samples and refusals of messages that were decoded individually, in order of arrival."""
 
     stream: Codes = column(np.uint8)
     stamps_ns: Stamps = column(np.int64)
@@ -121,21 +118,15 @@ class KeptMessages(RowTable):
 
     def __init__(self) -> None:
         super().__init__()
-        self.reserve(int(FULL * MOST))  # no row is ever dropped, so the whole capacity of MOST rows is used
         self._reasons: list[str] = []
-        self.is_kept = True
 
     def add(self, stream: Stream, decoded: Sample | str) -> None:
-        """Keep a message's sample, or the reason for its refusal."""
-        if not self.is_kept:
-            return
-        if self.size == MOST:
-            self.forget()
-            return
+        """Add a message's sample, or the reason for its refusal."""
         at = self.extend(1).start
         self.stream[at] = _CODES[stream]
         self.stamps_ns[at] = self.frames[at] = self.refused[at] = 0
         self.has_covariance[at] = False
+        self.values[at] = math.nan
         if isinstance(decoded, str):
             if decoded not in self._reasons:
                 self._reasons.append(decoded)
@@ -143,14 +134,48 @@ class KeptMessages(RowTable):
             return
         self.stamps_ns[at] = decoded.stamp_ns
         if isinstance(decoded, ImuSample):
-            self.values[at, :4] = decoded.orientation or _NOT_GIVEN
-            self.values[at, 4:] = decoded.angular_velocity or _NOT_GIVEN[:3]
+            for columns, given in ((slice(4), decoded.orientation), (slice(4, 7), decoded.angular_velocity)):
+                if given is not None:
+                    self.values[at, columns] = given
             return
         self.values[at, :3] = decoded.velocity
         if decoded.covariance is not None:
             self.covariance[at], self.has_covariance[at] = decoded.covariance, True
         if isinstance(decoded, ReferenceSample):
             self.frames[at] = FRAME_CODES[decoded.frame]
+
+    def block(self, stream: Stream, arrival: Stamps | None = None) -> SampleBlock:
+        """Return all samples of one stream. arrival: of all messages; their order by default."""
+        (rows,) = np.nonzero(self.stream[: self.size] == _CODES[stream])
+        has_covariance = self.has_covariance[rows]
+        given = Covariances.of(self.covariance[rows[has_covariance]], int(has_covariance.sum()))
+        index = np.full(len(rows), -1, dtype=np.intp)
+        index[has_covariance] = given.index
+        arrival = rows if arrival is None else arrival
+        return sample_block(
+            stream, self.stamps_ns[rows], self.values[rows, : WIDTH[stream]],
+            covariance=Covariances(given.distinct, index), frames=self.frames[rows], arrival=arrival,
+            refused=self.refused[rows], reasons=self._reasons,
+        )  # fmt: skip
+
+
+class KeptMessages(DecodedMessages):
+    """All messages so far, or none after more than `MOST`. is_kept: whether it has them.
+
+    The memory is allocated at the start, so that a node's memory does not grow with the messages received.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reserve(int(FULL * MOST))  # no row is ever dropped, so the whole capacity of MOST rows is used
+        self.is_kept = True
+
+    def add(self, stream: Stream, decoded: Sample | str) -> None:
+        """Keep a message's sample, or the reason for its refusal."""
+        if self.is_kept and self.size == MOST:
+            self.forget()
+        if self.is_kept:
+            super().add(stream, decoded)
 
     def forget(self) -> None:
         """Stop keeping messages."""
@@ -161,17 +186,4 @@ class KeptMessages(RowTable):
     @property
     def streams(self) -> Streams | None:
         """All messages; None if they are no longer kept."""
-        return Streams(*map(self._block, Stream)) if self.is_kept else None
-
-    def _block(self, stream: Stream) -> SampleBlock:
-        """Return all kept samples of one stream."""
-        (rows,) = np.nonzero(self.stream[: self.size] == _CODES[stream])
-        has_covariance = self.has_covariance[rows]
-        given = Covariances.of(self.covariance[rows[has_covariance]], int(has_covariance.sum()))
-        index = np.full(len(rows), -1, dtype=np.intp)
-        index[has_covariance] = given.index
-        return sample_block(
-            stream, self.stamps_ns[rows], self.values[rows, : WIDTH[stream]],
-            covariance=Covariances(given.distinct, index), frames=self.frames[rows], arrival=rows,
-            refused=self.refused[rows], reasons=self._reasons,
-        )  # fmt: skip
+        return Streams(*map(self.block, Stream)) if self.is_kept else None

@@ -135,10 +135,6 @@ def straight(start: Place, end: Place) -> Vector:
     return end[0] - start[0], end[1] - start[1], end[2] - start[2]
 
 
-def _geodetic(message: Any) -> Place:
-    return message.latitude, message.longitude, message.altitude
-
-
 def _of_pose(message: Any) -> Place:
     position = getattr(message.pose, "pose", message.pose).position
     return position.x, position.y, position.z
@@ -154,7 +150,7 @@ def _pose_covariance(message: Any) -> Any:
 
 SATELLITES = PositionType(
     is_valid=lambda message: message.status.status >= 0,
-    place=_geodetic,
+    place=lambda message: (message.latitude, message.longitude, message.altitude),
     covariance=lambda message: message.position_covariance if message.position_covariance_type else None,
     between=east_north_up,
     has_height=False,

@@ -53,21 +53,27 @@ from ..recordings.topics import Topics
 from ..standard_streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
-from .live_checks import GravitySeen, LateClocks, Pauses, steady_s
+from .diagnostics import (
+    RECENT_S,
+    GravitySeen,
+    LateClocks,
+    Pauses,
+    RecentCounts,
+    Silence,
+    diagnose,
+    input_problems,
+    output_problems,
+    steady_s,
+    twin_problems,
+)
 from .live_discovery import Discovering
-from .message_queue import Arrived, in_order_of_arrival, take
+from .message_queue import QUEUE, Arrived, in_order_of_arrival, take
 from .message_types import empty_twist, fill_errors, set_stamp, velocity_class
 from .operator_card import Card
-from .ros_parameters import declare_parameters
-from .services import LATCHED, AnsweringNode
+from .services import LATCHED, AnsweringNode, declare_parameters
 from .status import status_name
-from .topic_graph import input_problems, output_problems, twin_problems
-from .transforms import MountingOutput, Transforms
-from .water_topics import WaterHeard
+from .transforms import MountingOutput, Transforms, WaterHeard
 
-# messages that wait in the middleware while Python is busy: 5 s at 1 kHz
-QUEUE = 5000
 # The selected model is updated with every sample, because its estimate is published. The others are updated in blocks
 # of this number of samples, or when their estimate is requested.
 BLOCK_SIZE = 512
@@ -132,7 +138,10 @@ class CalibrationNode(AnsweringNode):
         for own, message_type in classes.items():
             self._subscribe(message_type, own)
         topics = {own: subscription.topic_name for own, subscription in self._inputs.items()}
-        _check_distinct(topics | {"~/calibrated_twist": self._corrected_publisher.topic_name})
+        used = topics | {"~/calibrated_twist": self._corrected_publisher.topic_name}
+        for first, second in combinations(used, 2):  # a DVL agrees with itself at any mounting
+            if used[first] == used[second]:
+                raise InputError(f"{first} and {second} are both {used[first]}; remap each to its own sensor's topic")
         now_s = self._pauses.running_s(steady_s())
         self._silence, self._recent, self._card = Silence(now_s, topics), RecentCounts(), Card(now_s)
         space = self.get_namespace().rstrip("/")
@@ -149,7 +158,9 @@ class CalibrationNode(AnsweringNode):
         self.add_post_set_parameters_callback(self._apply_parameters)
         # steady: diagnostics continue while simulated time stands still or jumps
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._log_configuration()
+        in_use = changed_parameters(self._calibrator.parameters)
+        changed = ", ".join(f"{name}: {value}" for name, value in in_use.items())
+        self.info(f"model {parameters.model}; parameters not at their default: {changed or 'none'}")
 
     def _named_topics(self, *, has_dvl: bool) -> dict[str, str | None]:
         """Return the topics that a search must keep, by role: remapped ones and, next to a DVL, published ones."""
@@ -252,12 +263,6 @@ class CalibrationNode(AnsweringNode):
         # every event callback is one more entity that the executor checks for every message
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
-
-    def _log_configuration(self) -> None:
-        """Log the model and all parameters that differ from their defaults."""
-        parameters = self._calibrator.parameters
-        changed = ", ".join(f"{name}: {value}" for name, value in changed_parameters(parameters).items())
-        self.info(f"model {parameters.model}; parameters not at their default: {changed or 'none'}")
 
     # ------------------------------------------------------------------ input
 
@@ -423,7 +428,9 @@ class CalibrationNode(AnsweringNode):
         problems = [*self._found, *decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)
         problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
-        self._read_water()
+        subscribed = [subscription.topic_name for subscription in self._inputs.values()]
+        dvl = (self._inputs["dvl/twist"].topic_name, decoder.dvl_type.name, self._newest_dvl)
+        self._water, self._newest_dvl = self._water_heard.update(subscribed, dvl), None
         if self._save_problem:
             problems.append(self._save_problem)
         now_s = self._pauses.running_s(steady_s())
@@ -435,11 +442,6 @@ class CalibrationNode(AnsweringNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
-
-    def _read_water(self) -> None:
-        subscribed = [subscription.topic_name for subscription in self._inputs.values()]
-        dvl = (self._inputs["dvl/twist"].topic_name, self._feed.decoder.dvl_type.name, self._newest_dvl)
-        self._water, self._newest_dvl = self._water_heard.update(subscribed, dvl), None
 
     def _topic_problems(self) -> list[Reason]:
         """Return the problems with publishers and subscribers of all topics."""
@@ -475,11 +477,10 @@ class CalibrationNode(AnsweringNode):
             return response
         try:
             self._save(Path(path), save)
-        except KeptError as error:
-            response.message = str(error)
         except InputError as error:
             response.message = str(error)
-            self.error(response.message)
+            if not isinstance(error, KeptError):
+                self.error(response.message)
         else:
             response.success, response.message = True, f"saved to {path}"
         return response
@@ -491,10 +492,9 @@ class CalibrationNode(AnsweringNode):
             with self._calibrator.settled():  # what is published is what is saved
                 save(path, self._result_document(), round(self._calibrator.parameters.result_backups))
                 self._publish_mounting(again=True)
-        except KeptError:
-            raise
         except InputError as error:
-            self._save_problem = finding("RESULT_NOT_SAVED", reason=error)
+            if not isinstance(error, KeptError):
+                self._save_problem = finding("RESULT_NOT_SAVED", reason=error)
             raise
 
     def _result_document(self) -> dict[str, Any]:
@@ -570,10 +570,3 @@ def _message_classes(parameters: Parameters) -> dict[str, type]:
         Topics.gnss: velocity_class("gnss_type", parameters.gnss_type),
         Topics.imu: Imu,
     }
-
-
-def _check_distinct(topics: Mapping[str, str]) -> None:
-    """Raise InputError if two of our topics were remapped to one: a DVL agrees with itself at any mounting."""
-    for first, second in combinations(topics, 2):
-        if topics[first] == topics[second]:
-            raise InputError(f"{first} and {second} are both {topics[first]}; remap each to its own sensor's topic")

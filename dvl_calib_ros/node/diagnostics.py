@@ -1,13 +1,18 @@
-"""Content of /diagnostics: one status of the running calibration."""
+"""Content of /diagnostics: the live checks, the faults of topics, and one status of the running calibration."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.duration import Infinite
+from rclpy.node import Node
+from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.checks.data_warnings import (
@@ -24,13 +29,199 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import arrival_offset
+from ..calibration.registration.clock_drift_and_jumps import REPORTED_FROM_S
+from ..calibration.registration.registration import OFFSETS, Registration
 from ..calibration.results.results import Estimate, scale_and_delay
 from ..calibration.streams.aligner import counts_by_use
+from ..discovery.gravity import contradictions
 from ..errors import printable
-from ..messages.drivers import VelocityType
+from ..messages.drivers import TYPES_OF, VelocityType
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding, of_consequence
 from .operator_card import Card
+
+# ROS 2's name of a node whose topic is discovered before the node
+UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
+
+
+def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[Reason]:
+    """Return the problems with the publishers of an input, with remedies.
+
+    type_parameter: parameter that selects the topic's type, if there is one.
+    """
+    topic, kind = subscription.topic_name, _type_name(subscription.msg_type)
+    publishers = node.get_publishers_info_by_topic(topic)
+    problems = [
+        finding(
+            "TOPIC_OTHER_TYPE",
+            topic=topic,
+            name=_name(info),
+            type=info.topic_type,
+            expected=kind,
+            remedy=_other_type_remedy(info.topic_type, type_parameter),
+        )
+        for info in publishers
+        if info.topic_type != kind
+    ]
+    rightly_typed = [info for info in publishers if info.topic_type == kind]
+    if len(rightly_typed) > 1:
+        names = ", ".join(map(_name, rightly_typed))
+        problems.append(finding("TOPIC_SEVERAL_PUBLISHERS", topic=topic, count=len(rightly_typed), names=names))
+    for info in rightly_typed:
+        reason = _incompatible(info.qos_profile, _in_full(subscription.qos_profile))
+        if reason:
+            problems.append(finding("TOPIC_QOS", topic=topic, name=_name(info), reason=reason))
+    return problems
+
+
+def _other_type_remedy(name: str, type_parameter: str | None) -> str:
+    if type_parameter is None or name not in TYPES_OF[type_parameter]:
+        return "remap one of the two, or convert"
+    return f"set {type_parameter} to it, or remap one of the two"
+
+
+def output_problems(node: Node, publisher: Any) -> list[Reason]:
+    """Return the subscribers of an output that cannot receive it, with the reason."""
+    problems = []
+    for info in node.get_subscriptions_info_by_topic(publisher.topic_name):
+        reason = _incompatible(_in_full(publisher.qos_profile), info.qos_profile)
+        if reason:
+            problems.append(finding("OUTPUT_QOS", topic=publisher.topic_name, name=_name(info), reason=reason))
+    return problems
+
+
+def twin_problems(node: Node, publisher: Any) -> list[Reason]:
+    """Report other publishers of the node's own topic: their estimates mix, and their files replace each other."""
+    publishers = node.get_publishers_info_by_topic(publisher.topic_name)
+    if len(publishers) < 2:
+        return []
+    names = ", ".join(map(_name, publishers))
+    return [finding("SECOND_NODE", topic=publisher.topic_name, count=len(publishers), names=names)]
+
+
+def _incompatible(offered: QoSProfile, requested: QoSProfile) -> str | None:
+    compatibility, reason = qos_check_compatible(offered, requested)
+    return reason.removeprefix("ERROR: ").rstrip(";") if compatibility == QoSCompatibility.ERROR else None
+
+
+def _in_full(own: QoSProfile) -> QoSProfile:
+    """Return one of the node's profiles with its defaults filled in, for comparison with others'."""
+    return QoSProfile(
+        depth=1,
+        reliability=own.reliability,
+        durability=own.durability,
+        deadline=Infinite,
+        liveliness=LivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=Infinite,
+    )
+
+
+def _name(info: Any) -> str:
+    if info.node_name == UNKNOWN_NAME:  # discovered later than its topic
+        return "unnamed node"
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
+def _type_name(message_type: type) -> str:
+    package, _, _ = message_type.__module__.split(".", 2)
+    return f"{package}/msg/{message_type.__name__}"
+
+
+# more than ten minutes of samples add nothing
+MOST = 600
+
+
+class GravitySeen:
+    """Collector of gravity samples of the IMU, selected by stamps so that a replay selects the same."""
+
+    def __init__(self) -> None:
+        self._second = -1
+        self._rows: list[tuple[float, ...]] = []
+
+    def add(self, message: Any) -> None:
+        """Add a sensor_msgs/Imu."""
+        second = message.header.stamp.sec
+        if second == self._second or len(self._rows) == MOST:
+            return
+        self._second = second
+        q, a = message.orientation, message.linear_acceleration
+        self._rows.append((q.x, q.y, q.z, q.w, a.x, a.y, a.z))
+
+    def problems(self, topic: str, parameters: Parameters) -> list[Reason]:
+        """Return the contradictions between gravity and the configured use of this topic."""
+        rows = np.array(self._rows, dtype=float).reshape(-1, 7)
+        return contradictions(topic, rows[:, :4], rows[:, 4:], parameters)
+
+
+class LateClocks:
+    """Clock offsets to subtract, once, if none was configured and two successive estimates agree.
+
+    found: reasons for the subtraction. is_final: whether nothing more is subtracted.
+    """
+
+    def __init__(self, given: Collection[str]) -> None:
+        """Set up. given: names of the parameters that the user set."""
+        self.is_final = bool(OFFSETS.keys() & set(given))
+        self._before: Registration | None = None
+        self.found: list[Reason] = []
+
+    def parameters(self, registration: Registration | None, parameters: Parameters) -> Parameters | None:
+        """Return parameters with the offsets of the newest estimate for a restart, or None if nothing changes."""
+        if self.is_final or registration is None or registration is self._before:
+            return None
+        before, self._before = self._before, registration
+        corrections = registration.corrections
+        if before is None or not corrections or not _are_alike(before.corrections, corrections):
+            return None
+        self.is_final = True
+        offsets = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in corrections.items()}
+        self.found = [
+            finding("CLOCK_TAKEN_OFF", clock=registration.clock_reason(name), parameter=name, value=seconds)
+            for name, seconds in offsets.items()
+        ]
+        return parameters.replace(**offsets)
+
+
+def _are_alike(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    return one.keys() == other.keys() and all(abs(one[name] - other[name]) < REPORTED_FROM_S for name in other)
+
+
+# A process that checks its clock every second and finds this much time gone was paused, s.
+PAUSE_S = 5.0
+
+
+def steady_s() -> float:
+    """Return seconds of a clock that nobody sets and that runs while the machine sleeps, if it has one (Linux)."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+class Pauses:
+    """Detector of pauses, to be called every second that the process runs. now_s: of `steady_s`."""
+
+    def __init__(self, now_s: float) -> None:
+        self._last_s = now_s
+        self._paused_s = 0.0
+        self._pauses: list[tuple[float, float]] = []
+
+    def running_s(self, now_s: float) -> float:
+        """Take a reading of the steady clock, detect a pause before it, and return the time (s) without pauses."""
+        gone_s = now_s - self._last_s
+        self._last_s = now_s
+        if gone_s > PAUSE_S:
+            self._paused_s += gone_s
+            self._pauses.append((now_s - self._paused_s, gone_s))
+        return now_s - self._paused_s
+
+    def within(self, seconds: float) -> list[float]:
+        """Return the lengths (s) of pauses that ended within the last `seconds` of running."""
+        running_s = self._last_s - self._paused_s
+        self._pauses = [pause for pause in self._pauses if running_s - pause[0] <= seconds]
+        return [length for _, length in self._pauses]
+
+    def forget(self) -> None:
+        """Forget all pauses before now."""
+        self._pauses.clear()
+
 
 # A stream without a usable sample for this time is silent, s.
 SILENCE_S = 5.0
@@ -274,7 +465,4 @@ def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) ->
     if not model.from_positions:  # these models use positions instead of DVL samples
         by_use = counts_by_use(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
         values |= {f"samples {name}": str(count) for name, count in by_use.items()}
-    for stream, tally in counts.items():
-        for name, count in tally.items():
-            values[f"{stream} {name}"] = str(count)
-    return values
+    return values | {f"{stream} {name}": str(n) for stream, tally in counts.items() for name, n in tally.items()}

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple, TypeVar
 from rclpy.exceptions import InvalidHandle
 from rclpy.subscription import Subscription
 
+# messages that wait in the middleware while Python is busy: 5 s at 1 kHz
+QUEUE = 5000
 # messages taken before services and timers get their turn
 ROUND = 1000
 Input = TypeVar("Input")

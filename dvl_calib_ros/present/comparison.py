@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,8 +19,6 @@ from .document import (
     Cell,
     Columns,
     Document,
-    Item,
-    Section,
     Sentence,
     Table,
     Where,
@@ -34,11 +31,11 @@ from .document import (
 from .numbers import counted, number, with_std
 
 if TYPE_CHECKING:
-    from ..fleet_catalogue.update import Fleet
-    from ..fleet_catalogue.vehicle_history import CompassDeviation, NeedsPerson, VehicleHistory
+    from ..fleet_catalogue.update import CompassDeviation, Fleet, NeedsPerson, VehicleHistory
 
 # with more pairs than these a terminal shows only neighbours in time
 MOST_PAIRS = 10
+_LATER = "Differences, the later less the earlier"
 OWN_NOTE = "± is 1σ as each calibration states it; – was not observable in its data."
 _DEGREE = math.degrees(1.0)
 
@@ -58,12 +55,8 @@ class ComparedQuantity(NamedTuple):
 
 
 QUANTITIES = (
-    ComparedQuantity(0, "roll", "°", _DEGREE, "moved"),
-    ComparedQuantity(1, "pitch", "°", _DEGREE, "moved"),
-    ComparedQuantity(2, "yaw", "°", _DEGREE, "moved"),
-    ComparedQuantity(3, "lever arm x", "m", 1.0, "moved"),
-    ComparedQuantity(4, "lever arm y", "m", 1.0, "moved"),
-    ComparedQuantity(5, "lever arm z", "m", 1.0, "moved"),
+    *(ComparedQuantity(k, name, "°", _DEGREE, "moved") for k, name in enumerate(("roll", "pitch", "yaw"))),
+    *(ComparedQuantity(3 + k, f"lever arm {axis}", "m", 1.0, "moved") for k, axis in enumerate("xyz")),
     ComparedQuantity(6, "scale", "%", 100.0, "scale_changed"),
     ComparedQuantity(7, LATE, "s", 1.0, "clock_changed"),
 )
@@ -86,31 +79,25 @@ def comparison(result: Comparison) -> Document:
             lambda each, quantity: with_std(*quantity.of(each)),
         ),
     }
-    own_values = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
+    own_values = table_by(columns, ordered, (OWN_NOTE,), words=3, dense=True)
     return Document(
         title="DVL calibrations compared",
         subtitle=", ".join(each.name for each in ordered),
         answer=Answer(result.word, result.answer.severity, [each.full_sentence for each in reasons(result)]),
         warnings=[str(each) for each in remarks(result)],
         sections=[
-            Section(
+            section(
                 "Over time",
-                [
-                    Sentence("With ±1σ; a dashed line marks a change.", soft=True),
-                    figures("comparison_figures.trend", result),
-                ],
-                Where.PAGE,
+                Sentence("With ±1σ; a dashed line marks a change.", soft=True),
+                figures("comparison_figures.trend", result),
+                where=Where.PAGE,
             ),
-            Section("Calibrations", [own_values]),
-            Section(
-                "Differences, the later less the earlier",
-                [_differences(pairs, by_name)],
-                Where.BOTH if few else Where.PAGE,
-            ),
-            Section(
-                "Differences, the later less the earlier (neighbours; all pairs: --json)",
-                [] if few else [_differences([pairs[k] for k in adjacent], [by_name[k] for k in adjacent])],
-                Where.TERMINAL,
+            section("Calibrations", own_values),
+            section(_LATER, _differences(pairs, by_name), where=Where.BOTH if few else Where.PAGE),
+            section(
+                f"{_LATER} (neighbours; all pairs: --json)",
+                None if few else _differences([pairs[k] for k in adjacent], [by_name[k] for k in adjacent]),
+                where=Where.TERMINAL,
             ),
         ],
     )
@@ -139,7 +126,7 @@ def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Tab
         "mounting: p": lambda each: f"{each[2]:.{'2f' if each[2] >= 0.01 else '0e'}}",
     }
     rows = [(name, each, each.chance(MOUNTING)) for name, each in zip(names, differences, strict=True)]
-    return replace(table_by(columns, rows, (DIFFERENCES_NOTE,)), dense=True)
+    return table_by(columns, rows, (DIFFERENCES_NOTE,), dense=True)
 
 
 # default speed of sound of instruments, m/s
@@ -185,6 +172,7 @@ def fleet(result: Fleet) -> Document:
         if each.water is not None
     ]
     several = any(len(each.recordings) > 1 for each in result.persons)
+    components = tuple(each.component for each in _ANGLES_AND_SCALE)
     compasses = [(each.name, each.heading) for each in vehicles if each.heading is not None]
     deviations = "; ".join(f"{name} up to {largest(heading):.2f}°" for name, heading in compasses)
     drawn = figure(
@@ -196,19 +184,22 @@ def fleet(result: Fleet) -> Document:
         answer=Answer(result.word, severity, sentences),
         warnings=result.notes,
         sections=[
-            Section(
+            section(
                 "Vehicles",
-                [
-                    *(Sentence(f"{each.history.name}: {each.word}. {each.why}") for each in current),
-                    replace(table_by(VEHICLES, current, (MOUNTING_NOTE,)), dense=True),
-                ],
+                *(Sentence(f"{each.history.name}: {each.word}. {each.why}") for each in current),
+                table_by(VEHICLES, current, (MOUNTING_NOTE,), dense=True),
             ),
             section(
                 "Recordings that need a person",
                 table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=3),
             ),
             *(
-                _trend_section(each.history.name, each.history.compared)
+                section(
+                    each.history.name,
+                    *(Sentence(reason.full_sentence) for reason in reasons(each.history.compared)),
+                    figures("comparison_figures.trend", each.history.compared, components),
+                    where=Where.PAGE,
+                )
                 for each in current
                 if each.history.compared is not None
             ),
@@ -219,7 +210,7 @@ def fleet(result: Fleet) -> Document:
             ),
             section(
                 "Deviation of the compass",
-                replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True),
+                table_by(COMPASS, compasses, (COMPASS_NOTE,), dense=True),
                 drawn if compasses else None,
             ),
         ],
@@ -324,14 +315,6 @@ COMPASS: Columns[tuple[str, CompassDeviation]] = {
         lambda each, k: with_std(each[1].value[k], each[1].std[k]),
     ),
 }
-
-
-def _trend_section(name: str, compared: Comparison) -> Section:
-    """Return the section of a vehicle's angles and scale over time."""
-    items: list[Item] = [Sentence(each.full_sentence) for each in reasons(compared)]
-    components = tuple(each.component for each in _ANGLES_AND_SCALE)
-    items.append(figures("comparison_figures.trend", compared, components))
-    return Section(name, items, Where.PAGE)
 
 
 SPEED_NOTE = (

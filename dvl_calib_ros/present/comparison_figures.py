@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ..calibration.comparison.mounting_change import Change, Comparison
 from ..calibration.results.extrinsics import N_COMPONENTS, Extrinsics
-from ..fleet_catalogue.vehicle_history import CompassDeviation
+from ..fleet_catalogue.update import CompassDeviation
 from .comparison import ComparedQuantity, deviation, shown_quantities
 from .figure_style import INK, Picture, drawing, legend_above, new_figure, picture
 
@@ -66,7 +66,8 @@ def _panel(comparison: Comparison, quantity: ComparedQuantity) -> Figure:
 def _draw_quantity(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:
     """Draw one quantity over time with ±1σ, and a line at each change."""
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
-    dated = _dated(comparison.calibrations)
+    # calibrations that follow each other; simulated ones may have equal stamps
+    dated = all(before.last_ns <= after.first_ns for before, after in pairwise(comparison.calibrations))
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
     value, std = np.array([quantity.of(each) for each in known]).T
     at = [_middle_day(each) if dated else float(order[id(each)]) for each in known]
@@ -90,11 +91,6 @@ def _draw_quantity(axes: Axes, comparison: Comparison, quantity: ComparedQuantit
     axes.set_ylabel(f"{quantity.name}, {quantity.unit}", color=INK)
     if changes:
         axes.legend(loc="best")
-
-
-def _dated(calibrations: Sequence[Extrinsics]) -> bool:
-    """Return whether the calibrations follow each other; simulated ones may have equal stamps."""
-    return all(before.last_ns <= after.first_ns for before, after in pairwise(calibrations))
 
 
 def _middle_day(each: Extrinsics) -> float:

@@ -17,7 +17,7 @@ from scipy.signal import welch
 from ..calibration.numerics.distributions import normal_isf, normal_sf
 from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin, RegressorPlot
-from ..unpaired.gap_ladder import ALL, AS_IT_IS, NOISE, Shrunk
+from ..unpaired.effect_comparison import ALL, AS_IT_IS, NOISE, Shrunk
 from ..unpaired.results import UnpairedComparison
 from .diagnosis import twin_errors
 from .figure_style import (
@@ -428,10 +428,12 @@ def noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
     intervals: Any = c.series.get("intervals")
     if residuals and all(residuals.values()):
         for axis, name in enumerate(DVL_AXES):
-            lines = {
-                side: residual_spectrum(max(residuals[side], key=len)[:, axis], float(np.median(intervals[side])))
-                for side in residuals
-            }
+            lines = {}
+            for side, of_side in residuals.items():
+                values, interval = max(of_side, key=len)[:, axis], float(np.median(intervals[side]))
+                per_segment = min(len(values), max(16, len(values) // 6))
+                frequency, power = welch(values, 1.0 / interval, nperseg=per_segment)
+                lines[side] = frequency[1:], np.sqrt(power[1:])
             yield picture(
                 f"Residual by frequency, {name} of the DVL",
                 f"Amplitude spectral density of each side's residual on {name}",
@@ -447,12 +449,6 @@ def level_bars(levels: Mapping[str, tuple[float, float]]) -> Figure:
         axes.barh(rows + (i - 0.5) * 0.38, values, height=0.34, color=colour, label=side)
     legend_above(axes)
     return figure
-
-
-def residual_spectrum(values: Array, interval: float) -> tuple[Array, Array]:
-    """Return frequency (F,) Hz and amplitude spectral density (F,) of values (N,)."""
-    frequency, power = welch(values, 1.0 / interval, nperseg=min(len(values), max(16, len(values) // 6)))
-    return frequency[1:], np.sqrt(power[1:])
 
 
 def residual_spectra(lines: Mapping[str, tuple[Array, Array]]) -> Figure:

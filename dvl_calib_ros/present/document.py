@@ -145,12 +145,14 @@ T = TypeVar("T")
 Columns = Mapping[str, Callable[[T], str | Cell]]
 
 
-def table_by(columns: Columns[T], objects: Iterable[T], notes: Sequence[str] = (), words: int = 1) -> Table:
+def table_by(
+    columns: Columns[T], objects: Iterable[T], notes: Sequence[str] = (), words: int = 1, dense: bool = False
+) -> Table:
     """Return a table with a row per object. Headings of text columns are aligned like their texts."""
     rows = [[column(each) for column in columns.values()] for each in objects]
     texts = [isinstance(cell, Cell) and cell.kind.startswith("text") for cell in rows[0]] if rows else ()
     head = [Cell(name, "text") if is_text else name for name, is_text in zip(columns, texts, strict=False)]
-    return Table(head, rows, notes=notes, words=words)
+    return Table(head, rows, notes=notes, words=words, dense=dense)
 
 
 Key = TypeVar("Key")

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from ..calibration.models import MODELS
-from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, Evaluation, HeldOut
+from ..evaluation.validation_study import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from .document import (
     CELL_KINDS,
@@ -309,18 +308,17 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
         "calibration run was held back in turn and corrected with a calibration that had not seen it; the noise of the "
         "reference is in all errors.",
     )
-    drawn = []
-    for name in sets:
-        of_set = [each for each in held_out if each.set_name == name]
-        drawn.append(
-            figure(
-                "replay_figures.held_out_errors",
-                f"{name}: error on held-out data",
-                "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in of_set),
-                [each.model for each in of_set],
-                *(np.array([getattr(each, kind) for each in of_set]) for kind in HELD_OUT_KINDS),
-            )
+    by_set = {name: [each for each in held_out if each.set_name == name] for name in sets}
+    drawn = [
+        figure(
+            "replay_figures.held_out_errors",
+            f"{name}: error on held-out data",
+            "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in of_set),
+            [each.model for each in of_set],
+            *(np.array([getattr(each, kind) for each in of_set]) for kind in HELD_OUT_KINDS),
         )
+        for name, of_set in by_set.items()
+    ]
     return section("Held-out verification", Table(("model", *sets), rows, notes=notes), *drawn)
 
 
@@ -345,24 +343,21 @@ def cross_check(check: CrossCheck) -> Document:
     for name, by_model in zip(check.names, check.corrected, strict=True):
         for model, row in zip(check.models, by_model, strict=True):
             errors.append((name, model, *(number(value, 4) for value in row.tolist())))
-    drifts = []
-    as_mounted: dict[str, Any] = {}  # hardly depends on the calibrating bag: the first one's
-    for calibrated, name, model in zip(check.bags, check.names, check.selected, strict=True):
-        navigations = [check.navigation.get((calibrated, verified)) for verified in check.bags]
-        drifts.append((name, model, [None if each is None else each.after for each in navigations]))
-        for verified, navigation in zip(check.bags, navigations, strict=True):
-            if navigation is not None:
-                as_mounted.setdefault(verified, navigation.before)
+    by_bag = [
+        (name, model, [check.navigation.get((calibrated, verified)) for verified in check.bags])
+        for calibrated, name, model in zip(check.bags, check.names, check.selected, strict=True)
+    ]
+    # as mounted, a drift hardly depends on the calibrating bag: the first one's
+    first = [next(filter(None, of_bag), None) for of_bag in zip(*(each for *_, each in by_bag), strict=True)]
+    drifts = [("nothing", "as mounted", [each and each.before for each in first])]
+    drifts += [(name, model, [each and each.after for each in navigations]) for name, model, navigations in by_bag]
     drift_rows = [
         (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in of_bags))
-        for name, model, of_bags in [("nothing", "as mounted", [*map(as_mounted.get, check.bags)]), *drifts]
+        for name, model, of_bags in drifts
     ]
     pictures: list[Item] = []
-    for verified, name in zip(check.bags, check.names, strict=True):
-        tracks = {}
-        for calibrated, calibrated_name in zip(check.bags, check.names, strict=True):
-            if (calibrated, verified) in check.navigation:
-                tracks[f"by {calibrated_name}"] = check.navigation[calibrated, verified]
+    for k, name in enumerate(check.names):
+        tracks = {f"by {other}": found for other, _, each in by_bag if (found := each[k]) is not None}
         if tracks:
             uncorrected = next(iter(tracks.values()))
             pictures.append(figures("replay_figures.navigation_pictures", uncorrected, tracks, f", {name}"))

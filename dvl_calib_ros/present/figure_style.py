@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from itertools import cycle, islice
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -88,16 +88,11 @@ class LineStyle(NamedTuple):
     linestyle: str
 
 
-def _styles() -> dict[str, LineStyle]:
-    """Return the line style of each model: a colour, and dashes by its kind of reference."""
-    colours = islice(cycle(_COLOURS), len(MODELS))
-    return {
-        name: LineStyle(colour, "-." if model.from_positions else "-" if model.aided else "--")
-        for (name, model), colour in zip(MODELS.items(), colours, strict=True)
-    }
-
-
-MODEL_STYLES = _styles()
+# line style of each model: a colour, and dashes by its kind of reference
+MODEL_STYLES = {
+    name: LineStyle(colour, "-." if model.from_positions else "-" if model.aided else "--")
+    for (name, model), colour in zip(MODELS.items(), cycle(_COLOURS), strict=False)
+}
 
 
 @dataclass(frozen=True)
@@ -166,15 +161,11 @@ def log_scale(axes: Axes, names: str) -> None:
     """Make axes logarithmic, such as ``xy``, with plain numbers at the ticks."""
     for name in names:
         getattr(axes, f"set_{name}scale")("log")
-        _plain_log_ticks(getattr(axes, f"{name}axis"))
-
-
-def _plain_log_ticks(axis: Axis) -> None:
-    """Format the ticks of a logarithmic axis as plain numbers."""
-    low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+        axis: Axis = getattr(axes, f"{name}axis")
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def picture(title: str, alt: str, draw: Callable[..., Figure], *arguments: Any, caption: str = "") -> Picture:
@@ -204,11 +195,6 @@ def _rounded(path: re.Match[bytes]) -> bytes:
 POINTS = 1500
 # labels (matplotlib's free gid) of axes over time, and of the marks of omitted time
 TIME_MARK, BREAK_MARK = "time", "cut out"
-
-
-def mark_time(axes: Axes, run: str) -> None:
-    """Mark the x axis as time of a run: figures of one run share cursor and zoom."""
-    axes.set_gid(f"{TIME_MARK} {run}")
 
 
 class MapTrack(Line2D):
@@ -342,7 +328,7 @@ class TimeAxis:
 
     def label_time(self, axes: Axes) -> None:
         """Label the axis and mark omitted time."""
-        mark_time(axes, self.run)
+        axes.set_gid(f"{TIME_MARK} {self.run}")  # figures of one run share cursor and zoom
         axes.set_xlabel(self.label)
         axes.set_xlim(self._shown[0], max(self._shown[-1], 1e-3))
         for start, end in self.breaks:

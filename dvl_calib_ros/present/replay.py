@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bag_replay.replay import Replayed
 from ..calibration.assessment.dead_reckoning import in_words, metres
 from ..calibration.assessment.manoeuvre_planner import drift_left_open
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.frames import Array, rpy_from_rotation
+from ..calibration.numerics.frames import rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.results.mounting_quantities import not_shown, quantities
 from ..calibration.results.results import Estimate, Result, Verification
@@ -186,11 +185,7 @@ def replayed(
         answer=_verdict_answer(verification),
         warnings=shown_warnings,
         sections=[
-            section(
-                "",
-                worth,
-                where=Where.PAGE,
-            ),
+            section("", worth, where=Where.PAGE),
             section(_headline(run, rejected), *([Sentence(NO_MOUNTING)] if rejected else _mounting(run))),
             section("", None if rejected else figures("replay_figures.mounting_pictures", result), where=Where.PAGE),
             section("", facts_by(FACTS, run), where=where),
@@ -386,24 +381,9 @@ class Term(NamedTuple):
 
 
 _DEGREE = math.degrees(1.0)
-ANGLES = (
-    Term(0, "φx", "Misalignment about x", "°", _DEGREE),
-    Term(1, "φy", "Misalignment about y", "°", _DEGREE),
-    Term(2, "φz", "Misalignment about z", "°", _DEGREE),
-)
-SCALES = (
-    Term(3, "δk x", "Scale error along x", " %", 100.0),
-    Term(4, "δk y", "Scale error along y", " %", 100.0),
-    Term(5, "δk z", "Scale error along z", " %", 100.0),
-)
+ANGLES = tuple(Term(k, f"φ{axis}", f"Misalignment about {axis}", "°", _DEGREE) for k, axis in enumerate("xyz"))
+SCALES = tuple(Term(3 + k, f"δk {axis}", f"Scale error along {axis}", " %", 100.0) for k, axis in enumerate("xyz"))
 ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
-
-
-def _error_terms(estimate: Estimate) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return φ (3) and δk (3), their standard deviations, and whether the model estimates them; each (6,)."""
-    terms = MODELS[estimate.model].error_terms_from_state
-    variance = np.diag(terms @ estimate.covariance @ terms.T)
-    return terms @ estimate.state, np.sqrt(variance), np.asarray(terms.any(axis=1))
 
 
 def state_of(model: Model, term: Term) -> int:
@@ -419,10 +399,15 @@ def scale_terms(model: Model) -> list[Term]:
     return terms
 
 
+def terms_of(models: Sequence[str]) -> tuple[Term, ...]:
+    """Return the error terms of some models: one for the scale, or one per axis if a model has several."""
+    per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in models)
+    return *ANGLES, *(SCALES if per_axis else (ANY_SCALE,))
+
+
 def estimate_table(result: Result, models: Sequence[str]) -> Table:
     """Return one row per model, the selected one marked."""
-    per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in models)
-    terms = (*ANGLES, *(SCALES if per_axis else (ANY_SCALE,)))
+    terms = terms_of(models)
     rows = []
     for name in models:
         estimate = result.estimates[name]
@@ -445,7 +430,9 @@ def estimate_table(result: Result, models: Sequence[str]) -> Table:
 def _cells(estimate: Estimate, terms: Sequence[Term]) -> list[str]:
     """Return error terms with ±1σ; – if the model has none, ? if not observable."""
     model = MODELS[estimate.model]
-    value, std, estimated = _error_terms(estimate)
+    of_state = model.error_terms_from_state
+    value, std = of_state @ estimate.state, np.sqrt(np.diag(of_state @ estimate.covariance @ of_state.T))
+    estimated = np.asarray(of_state.any(axis=1))
     cells = []
     for term in terms:
         if not estimated[term.row]:

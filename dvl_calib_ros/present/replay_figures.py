@@ -42,7 +42,7 @@ from .figure_style import (
     running_mean,
     thin,
 )
-from .replay import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
+from .replay import Term, state_of, terms_of
 
 GOOD, WARNING, BAD, AFTER = "#2a7f62", "#e0a030", "#c0392b", "#1f6fb2"
 
@@ -393,19 +393,15 @@ def calibration_figure(replayed: Replayed) -> Figure:
             (navigation.error_before, "before", _COLOURS[2]),
             (navigation.error_after, "after", _COLOURS[0]),
         ):
-            _draw_errors(errors, 1e-9 * (navigation.stamps_ns - first_ns), each, name, colour)
+            length = np.linalg.norm(each, axis=1)  # as points
+            label = f"{name}: {float(np.sqrt(np.mean(length**2))):.3f} m/s rms"
+            seconds = 1e-9 * (navigation.stamps_ns - first_ns)
+            errors.plot(seconds, length, ".", markersize=3, color=colour, alpha=0.6, label=label)
         _legend_above(errors)
     errors.set(xlabel="time, s", ylabel="DVL less reference, m/s")
     for axes in (angles, errors):
         axes.grid(True, alpha=0.3)
     return figure
-
-
-def _draw_errors(axes: Axes, time: Array, error: Array, name: str, colour: str) -> None:
-    """Draw the length of an error (N, 3) as points, with its root mean square."""
-    length = np.linalg.norm(error, axis=1)
-    rms = float(np.sqrt(np.mean(length**2)))
-    axes.plot(time, length, ".", markersize=3, color=colour, alpha=0.6, label=f"{name}: {rms:.3f} m/s rms")
 
 
 def _legend_above(axes: Axes) -> None:
@@ -431,7 +427,7 @@ FATES: Mapping[str, Callable[[Result, str], int]] = {
 def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]) -> Iterable[Picture]:
     """Draw the estimates of some models over time, and their innovations."""
     time = TimeAxis(history.stamps_ns)
-    for term in (*ANGLES, *_scales_shown(models)):
+    for term in terms_of(models):
         lines = [
             _model_line(name, history.models[name], term)
             for name in models
@@ -450,13 +446,6 @@ def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]
         innovations_over_time, time, history.stamps_ns, nis, result.selected,
         caption="Running mean. The model expects 1 (line): above it the σ is too small, below too large.",
     )  # fmt: skip
-
-
-def _scales_shown(models: Sequence[str]) -> list[Term]:
-    """Return one figure for the scale, or one per axis if a model has more than one scale error."""
-    if any(len(scale_terms(MODELS[name])) > 1 for name in models):
-        return list(SCALES)
-    return [ANY_SCALE]
 
 
 def _model_line(name: str, history: ModelHistory, term: Term) -> ModelLine:

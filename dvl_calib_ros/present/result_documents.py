@@ -15,29 +15,21 @@ from ..fleet_catalogue.update import Fleet
 from ..unpaired.results import UnpairedComparison, unpaired_document
 from ..unpaired.simulator_rounds import ClosedGap, closed_gap_document
 from .comparison import comparison, fleet
-from .diagnosis import diagnosis
+from .diagnosis import diagnosis, unpaired
 from .document import Document
 from .evaluation import cross_check, evaluation
 from .examination import examination
-from .unpaired import unpaired
 
-DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
-    ClosedGap: unpaired,
-    Comparison: comparison,
-    CrossCheck: cross_check,
-    Diagnosis: diagnosis,
-    Evaluation: evaluation,
-    Examination: examination,
-    Fleet: fleet,
-    UnpairedComparison: unpaired,
+# layout, and plain data for JSON; those of a fleet are its catalogue
+_RESULTS: Mapping[type, tuple[Callable[[Any], Document], Callable[[Any], dict[str, Any]] | None]] = {
+    ClosedGap: (unpaired, closed_gap_document),
+    Comparison: (comparison, comparison_document),
+    CrossCheck: (cross_check, cross_check_document),
+    Diagnosis: (diagnosis, diagnosis_document),
+    Evaluation: (evaluation, evaluation_document),
+    Examination: (examination, Examination.document),
+    Fleet: (fleet, None),
+    UnpairedComparison: (unpaired, unpaired_document),
 }
-# for JSON; the plain data of a fleet are its catalogue
-PLAIN_DATA: Mapping[type, Callable[[Any], dict[str, Any]]] = {
-    ClosedGap: closed_gap_document,
-    Comparison: comparison_document,
-    CrossCheck: cross_check_document,
-    Diagnosis: diagnosis_document,
-    Evaluation: evaluation_document,
-    Examination: Examination.document,
-    UnpairedComparison: unpaired_document,
-}
+DOCUMENTS = {kind: layout for kind, (layout, _) in _RESULTS.items()}
+PLAIN_DATA = {kind: plain for kind, (_, plain) in _RESULTS.items() if plain is not None}

@@ -156,7 +156,8 @@ class Singles:
             of_channel = np.flatnonzero(self.channel == number)
             kind = VELOCITY_TYPES.get(channel.msgtype)
             if kind is not None and kind.adapted is not None:  # a message without header
-                stamps_ns[of_channel] = [_stamp_or_none(message) for _, _, message, _ in self.messages(of_channel)]
+                messages = (message for _, _, message, _ in self.messages(of_channel))
+                stamps_ns[of_channel] = [0 if each is None else stamp_ns(each.header.stamp) for each in messages]
             else:
                 stamps_ns[of_channel] = self._header_stamps_ns(of_channel)
         return stamps_ns
@@ -396,10 +397,6 @@ def _broken(kind: VelocityType, columns: MessageColumns, parameters: Parameters)
         for code, rule in enumerate(kind.rules, start=1):
             broken[np.asarray(rule.broken(columns, parameters)) & (broken == 0)] = code
     return broken
-
-
-def _stamp_or_none(message: Any) -> int:
-    return 0 if message is None else stamp_ns(message.header.stamp)
 
 
 def stamped(message: Any, log_ns: int) -> int:

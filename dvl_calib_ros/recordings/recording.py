@@ -41,8 +41,7 @@ from ..verdict.reasons import Reason, finding
 from .columns import Collector, DecodedRows, TopicColumns, is_kept
 from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
-from .topic_messages import Recorded, recorded
-from .topic_preview import Survey, preview_of
+from .topic_messages import Recorded, Survey, preview_of, recorded
 from .topics import NONE, ORIENTATION, Topics, spelled
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"

@@ -25,6 +25,7 @@ from ..calibration.numerics.samples import (
     sample_block,
 )
 from ..messages.decode import AS_SENT, HALF_TURN, WRONG_FRAME, Axes, MessageDecoder, Refusal
+from ..messages.live_feed import DecodedMessages
 from .columns import DecodedRows, TopicColumns
 
 # messages of a stretch: enough for columns to be efficient, few enough for the caches
@@ -205,35 +206,10 @@ def _stamped(stream: Stream, decoded: DecodedRows, decoder: MessageDecoder, refu
 
 def _of_rows(stream: Stream, rows: list[tuple[int, Decoded]]) -> SampleBlock:
     """Return the samples that were decoded individually."""
-    n = len(rows)
-    reasons: list[str] = []
-    refused, frames = np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
-    stamps_ns = np.zeros(n, dtype=np.int64)
-    values = np.full((n, 7 if stream is Stream.IMU else 3), np.nan)
-    distinct: list[Array] = []
-    index = np.full(n, -1, dtype=np.intp)
-    for row, (_, decoded) in enumerate(rows):
-        if isinstance(decoded, Refusal):
-            refused[row] = 1 + _index_of_reason(reasons, decoded.reason)
-            continue
-        stamps_ns[row] = decoded.stamp_ns
-        if isinstance(decoded, ImuSample):
-            values[row, :4] = np.nan if decoded.orientation is None else decoded.orientation
-            values[row, 4:] = np.nan if decoded.angular_velocity is None else decoded.angular_velocity
-            continue
-        values[row] = decoded.velocity
-        if isinstance(decoded, ReferenceSample):
-            frames[row] = FRAME_CODES[decoded.frame]
-        if decoded.covariance is not None:
-            if not distinct or distinct[-1] is not decoded.covariance:
-                distinct.append(decoded.covariance)
-            index[row] = len(distinct) - 1
-    covariances = Covariances(np.array(distinct).reshape(-1, 3, 3), index)
-    arrival = np.array([arrival for arrival, _ in rows], dtype=np.int64)
-    return sample_block(
-        stream, stamps_ns, values, covariance=covariances, frames=frames, arrival=arrival, refused=refused,
-        reasons=reasons,
-    )  # fmt: skip
+    messages = DecodedMessages()
+    for _, decoded in rows:
+        messages.add(stream, decoded.reason if isinstance(decoded, Refusal) else decoded)
+    return messages.block(stream, np.array([arrival for arrival, _ in rows], dtype=np.int64))
 
 
 def _index_of_reason(reasons: list[str], reason: str) -> int:

@@ -25,23 +25,37 @@ from ..diagnosis.search.effect_selection import EffectSelection
 from ..effects.base import EffectInput
 from ..effects.registry import EFFECTS
 from ..verdict.reasons import Reason, finding
-from .both_sides import Log, RecordedSide, read_log
+from .both_sides import (
+    BLOCK,
+    FEWEST_BLOCKS,
+    OUTLIER,
+    Candidate,
+    Log,
+    RecordedSide,
+    compare_streams,
+    mean_of,
+    read_log,
+    shares_of,
+    welch,
+)
 from .effect_comparison import (
+    AS_IT_IS,
+    NOISE,
     Size,
     common_names,
     compared_names,
     fitted,
     is_there,
     location_of,
+    models,
     p_alike,
+    shrink,
     sizes,
     smallest_difference,
     trace_of,
     union,
 )
-from .gap_ladder import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, SimulatorVerdict, UnpairedComparison
-from .stream_comparison import BLOCK, FEWEST_BLOCKS, OUTLIER, Candidate, compare_streams, mean_of, shares_of, welch
 
 # Comparison of both sides' noise: level per axis, growth with motion, tails, colour.
 #
@@ -343,8 +357,9 @@ def other_frame(vehicle: RecordedSide, simulator: RecordedSide) -> tuple[Reason,
 def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
     """Run `compare` for sides that are already read and diagnosed."""
     selections = vehicle.selection, simulator.selection
+    sides = {"vehicle": vehicle, "simulator": simulator}
     if selections[0] is None or selections[1] is None:
-        return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
+        return _nothing_to_compare({side: log.diagnosis for side, log in sides.items()})
     candidates = [*compare_noise(vehicle, simulator), *compare_streams(vehicle, simulator)]
     names = common_names(vehicle, simulator)
     compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names))
@@ -369,28 +384,16 @@ def compare_logs(vehicle: Log, simulator: Log) -> UnpairedComparison:
         levels={name: (level, levels[1][name]) for name, level in levels[0].items() if name in levels[1]},
         rungs=shrunk.rungs,
         floor_mps=shrunk.floor,
-        not_shown={side: _unobserved(log.diagnosis) for side, log in (("vehicle", vehicle), ("simulator", simulator))},
+        not_shown={side: _unobserved(log.diagnosis) for side, log in sides.items()},
         vehicle=vehicle.diagnosis,
         simulator=simulator.diagnosis,
-        notes=tuple(
-            f"{side}: {note}"
-            for side, log in (("vehicle", vehicle), ("simulator", simulator))
-            for note in log.diagnosis.notes
-        ),
-        series=_series(shrunk, vehicle, simulator),
-    )
-
-
-def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
-    """Return the data of the figures."""
-    return {
-        "shrunk": shrunk,
-        "residuals": {"vehicle": vehicle.residuals, "simulator": simulator.residuals},
-        "intervals": {
-            side: [recording.dvl.interval for recording in log.recordings]
-            for side, log in (("vehicle", vehicle), ("simulator", simulator))
+        notes=tuple(f"{side}: {note}" for side, log in sides.items() for note in log.diagnosis.notes),
+        series={
+            "shrunk": shrunk,
+            "residuals": {side: log.residuals for side, log in sides.items()},
+            "intervals": {side: [one.dvl.interval for one in log.recordings] for side, log in sides.items()},
         },
-    }
+    )
 
 
 class _Compared:
@@ -551,14 +554,15 @@ def _reasons(
     return tuple(reasons)
 
 
-def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedComparison:
+def _nothing_to_compare(sides: Mapping[str, Diagnosis]) -> UnpairedComparison:
     """Return the comparison if at least one side could not be diagnosed."""
     reasons = tuple(
         finding("SIMULATOR_NOTHING_COMPARED", side=side, why=diagnosis.reasons)
-        for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))
+        for side, diagnosis in sides.items()
         if diagnosis.selection is None
     )
-    sides: dict[str, dict[str, str]] = {"vehicle": {}, "simulator": {}}
+    not_shown: dict[str, dict[str, str]] = {side: {} for side in sides}
+    vehicle, simulator = sides.values()
     return UnpairedComparison(
-        SimulatorVerdict.CANNOT_TELL, reasons, (), (), {}, (), float("nan"), sides, vehicle, simulator
+        SimulatorVerdict.CANNOT_TELL, reasons, (), (), {}, (), float("nan"), not_shown, vehicle, simulator
     )

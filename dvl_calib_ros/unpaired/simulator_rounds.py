@@ -33,7 +33,7 @@ from ..verdict.answering import Answering
 from ..verdict.reasons import Reason, finding
 from .both_sides import RecordedSide, read_log
 from .comparison import CLAIMED, compare, compare_logs, other_frame
-from .gap_ladder import is_of_every_run
+from .effect_comparison import is_of_every_run
 from .results import ComparedEffect, SimulatorVerdict, Triple, UnpairedComparison, unpaired_document
 
 MOST_ROUNDS = 9

@@ -47,7 +47,7 @@ from dvl_calib_ros.fleet_catalogue.recording_entry import Entry
 from dvl_calib_ros.fleet_catalogue.update import ASIDE, Catalogue, CataloguePart
 from dvl_calib_ros.logs.dvl_log import DvlLog
 from dvl_calib_ros.logs.dvl_logs import read_dvl_log
-from dvl_calib_ros.logs.pd0_nmea import read_rmc
+from dvl_calib_ros.logs.text_logs import read_rmc
 from dvl_calib_ros.logs.trajectories import read_attitude, read_columns, read_table
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE

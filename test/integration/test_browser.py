@@ -16,9 +16,9 @@ from report_fixtures import comparison, cross_checked, diagnosis, evaluation, re
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.parallel import Workers
+from dvl_calib_ros.present.diagnosis import COMPARED_EFFECTS
 from dvl_calib_ros.present.document import Document, section, table_by
 from dvl_calib_ros.present.page import write_document, write_report
-from dvl_calib_ros.present.unpaired import EFFECTS
 from dvl_calib_ros.unpaired.results import ComparedEffect, ComparisonStatus, Lies
 
 pytestmark = pytest.mark.slow
@@ -116,7 +116,7 @@ def test_long_names_of_effects_break_where_a_tablet_is_too_narrow(browser, tmp_p
         Lies("y", 0.9, "accelerating", 0.8, (0.05, 0.2), 0.7),
     )  # fmt: skip
     path = tmp_path / "effects.html"
-    write_document(path, Document("Effects", "", None, [], [section("", table_by(EFFECTS, [effect]))]))
+    write_document(path, Document("Effects", "", None, [], [section("", table_by(COMPARED_EFFECTS, [effect]))]))
     page = browser.new_page(viewport={"width": 820, "height": 900})
     page.goto(path.as_uri())
     assert page.evaluate("(e => e.scrollWidth <= e.clientWidth)(document.querySelector('.scroll'))")

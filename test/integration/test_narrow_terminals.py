@@ -26,7 +26,7 @@ from dvl_calib_ros.cli import common
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.cli.watch import View
 from dvl_calib_ros.files.result_file import result_document, result_text
-from dvl_calib_ros.node.status import Status
+from dvl_calib_ros.node.listener import Status
 from dvl_calib_ros.present.terminal import Folding
 
 WIDTHS = [80, 20]

@@ -60,7 +60,7 @@ def registered(monkeypatch) -> Counter[str]:
         return register
 
     for name in (
-        "discovery.clock_offsets",
+        "discovery.discovery",
         "calibration.estimators.registration_schedule",
         "diagnosis.search.initial_guess",
     ):
@@ -99,7 +99,7 @@ def test_a_command_opens_reads_and_registers_each_recording_once(
     if words in REGISTERED:
         discovery, calibration = REGISTERED[words]
         assert +registered == Counter(
-            {"discovery.clock_offsets": discovery, "calibration.estimators.registration_schedule": calibration}
+            {"discovery.discovery": discovery, "calibration.estimators.registration_schedule": calibration}
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from round_trip import run
 
-from dvl_calib_ros.simulator_export.registry import SIMULATORS
+from dvl_calib_ros.simulator_export.simulators import SIMULATORS
 
 
 @pytest.mark.slow

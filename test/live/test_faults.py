@@ -42,7 +42,7 @@ from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.files.result_file import load_initial_calibration
-from dvl_calib_ros.node.live_checks import PAUSE_S
+from dvl_calib_ros.node.diagnostics import PAUSE_S
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors, equivalent_error_terms
 

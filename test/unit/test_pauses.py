@@ -12,7 +12,7 @@ from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvl_calib_ros.node.live_checks import PAUSE_S, Pauses, steady_s
+from dvl_calib_ros.node.diagnostics import PAUSE_S, Pauses, steady_s
 
 
 @given(steps=st.lists(st.floats(0.01, 100.0), max_size=50))
@@ -40,7 +40,7 @@ def test_a_pause_is_told_of_for_a_minute_of_running():
 
 
 def test_the_clock_goes_on_while_a_process_is_stopped():
-    script = "from dvl_calib_ros.node.live_checks import *; print(steady_s(), flush=True); input(); print(steady_s())"
+    script = "from dvl_calib_ros.node.diagnostics import *; print(steady_s(), flush=True); input(); print(steady_s())"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment

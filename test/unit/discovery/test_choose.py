@@ -9,7 +9,7 @@ import pytest
 
 from dvl_calib_ros.discovery.topic_choice import choose_dvl, choose_imu, choose_reference, may_be_dvl
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
-from dvl_calib_ros.recordings.topic_preview import Preview, Survey
+from dvl_calib_ros.recordings.topic_messages import Preview, Survey
 
 
 def survey(*topics: str, msgtype: str = TWIST_TYPE) -> Survey:

@@ -8,10 +8,17 @@ import pytest
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import nearest_rotation, rotation_of
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.convergence import TIMES_S, curve_keys, curves, squared_errors
-from dvl_calib_ros.evaluation.metrics import BASELINES
 from dvl_calib_ros.evaluation.protocol import own_trajectories
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS, dvl_velocities, references
+from dvl_calib_ros.evaluation.results import BASELINES
+from dvl_calib_ros.evaluation.validation_study import (
+    DEFAULTS,
+    TIMES_S,
+    curve_keys,
+    curves,
+    dvl_velocities,
+    references,
+    squared_errors,
+)
 
 MODELS = ("M3", "unaided")
 

@@ -19,7 +19,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.evaluation import metrics, protocol, validation_study
+from dvl_calib_ros.evaluation import protocol, results, validation_study
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
 from dvl_calib_ros.evaluation.protocol import Trajectory, load_folder, own_trajectories
 from dvl_calib_ros.evaluation.results import UNCALIBRATED, Improvement
@@ -129,13 +129,13 @@ def test_vrmse_from_moments_is_that_of_the_samples(rng):
     correction = rng.normal(np.eye(3), 0.05, (4, 3, 3))
     corrected = np.einsum("bij,bnj->bni", correction, measured)
     direct = np.sqrt(np.mean(np.sum((truth - corrected) ** 2, axis=-1), axis=-1))
-    np.testing.assert_allclose(metrics.vrmse(metrics.RunMoments.of(measured, truth), correction), direct, rtol=1e-12)
+    np.testing.assert_allclose(results.vrmse(results.RunMoments.of(measured, truth), correction), direct, rtol=1e-12)
 
 
 def test_coverage_of_errors_as_large_as_claimed_is_68_and_95_per_cent(rng):
     std = rng.uniform(0.5, 2.0, (20_000, 2))
     errors = rng.normal(0.0, std) * [1.0, 2.0]
-    found = metrics.coverage("M1", ("honest", "overconfident"), errors, std)
+    found = results.coverage("M1", ("honest", "overconfident"), errors, std)
     assert found.within_68 == pytest.approx([0.680, 0.381], abs=0.012)
     assert found.within_95 == pytest.approx([0.950, 0.673], abs=0.012)
     assert found.normalised_rms == pytest.approx(np.sqrt(2.5), rel=0.02)

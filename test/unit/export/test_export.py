@@ -18,8 +18,7 @@ from yaml_text import parsed, written
 
 from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.simulator_export.dvl_description import DvlDescription, Other, load_description
-from dvl_calib_ros.simulator_export.registry import SIMULATORS
-from dvl_calib_ros.simulator_export.writer import export
+from dvl_calib_ros.simulator_export.simulators import SIMULATORS, export
 
 STD = (0.0103, 0.0103, 0.00266)  # of beams 20 degrees from vertical with 5 mm/s each
 FOUND = DvlDescription(

@@ -19,7 +19,7 @@ from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.logs.dvl_logs import is_dvl_log, read_dvl_log
-from dvl_calib_ros.logs.pd0_nmea import read_rmc
+from dvl_calib_ros.logs.text_logs import read_rmc
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_files
 
 KNOT = 1852.0 / 3600.0

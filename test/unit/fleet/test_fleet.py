@@ -26,8 +26,7 @@ import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.checks.speed_of_sound import speed_of_sound
 from dvl_calib_ros.calibration.comparison.mounting_change import compare
 from dvl_calib_ros.fleet_catalogue import update as running
-from dvl_calib_ros.fleet_catalogue.update import Catalogue
-from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued, histories, need_person
+from dvl_calib_ros.fleet_catalogue.update import Catalogue, Catalogued, histories, need_person
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 from dvl_calib_ros.present.comparison import QUANTITIES, fleet
 from dvl_calib_ros.present.comparison_figures import _draw_quantity

@@ -18,7 +18,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.messages import live_feed
 from dvl_calib_ros.messages.live_feed import MessageFeed
-from dvl_calib_ros.node.live_checks import LateClocks
+from dvl_calib_ros.node.diagnostics import LateClocks
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag

@@ -10,7 +10,7 @@ from remedies import changes
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.node.live_checks import GravitySeen
+from dvl_calib_ros.node.diagnostics import GravitySeen
 
 
 def message(at_s, *, sign=1.0, unit=9.81, inverted=False):

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from io_fixtures import run, write_bag
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.recordings import topic_preview as looking
+from dvl_calib_ros.recordings import topic_messages as looking
 from dvl_calib_ros.recordings.recording import hold_the_same, open_recording
-from dvl_calib_ros.recordings.topic_preview import BURST_EVERY_NS, BURST_NS, BURSTS, in_bursts
+from dvl_calib_ros.recordings.topic_messages import BURST_EVERY_NS, BURST_NS, BURSTS, in_bursts
 from dvl_calib_ros.recordings.topics import Topics
 
 

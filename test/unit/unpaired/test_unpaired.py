@@ -32,13 +32,17 @@ from dvl_calib_ros.simulator_export.dvl_description import load_description
 from dvl_calib_ros.unpaired import simulator_rounds
 from dvl_calib_ros.unpaired.both_sides import Log, RecordedSide, facts_of, is_copied, read_log
 from dvl_calib_ros.unpaired.comparison import Scatter, at_one_motion, block_levels, compare_logs, slopes_of
-from dvl_calib_ros.unpaired.effect_comparison import Size, compared_names, is_there, p_alike, smallest_difference
-from dvl_calib_ros.unpaired.gap_ladder import (
+from dvl_calib_ros.unpaired.effect_comparison import (
     AS_IT_IS,
     NOISE,
     SimulatedModel,
+    Size,
+    compared_names,
+    is_there,
     noise_spectrum,
+    p_alike,
     shrink,
+    smallest_difference,
     turned_over,
     two_samples,
 )
