@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from ..unpaired.results import (
     SimulatorVerdict,
     UnpairedComparison,
 )
-from ..unpaired.simulator_rounds import ClosedGap, Round
 from ..verdict.kinds import Severity
 from .document import (
     Answer,
@@ -48,6 +47,9 @@ from .document import (
     table_by,
 )
 from .numbers import intervals, mm, p_value, quantity, share, three, two, with_std
+
+if TYPE_CHECKING:
+    from ..unpaired.simulator_rounds import ClosedGap, Round
 
 NOISE_MEANING = {
     "outliers": "share of samples far outside the noise",
@@ -417,6 +419,8 @@ def unpaired(found: UnpairedComparison | ClosedGap) -> Document:
 
     With rounds, the gap by round comes first, and the rest is about the best round.
     """
+    from ..unpaired.simulator_rounds import ClosedGap, Round  # slow: scipy.stats
+
     closed = found if isinstance(found, ClosedGap) else ClosedGap((Round(found),))
     c, reasons = closed.rounds[closed.best].comparison, found.reasons
     compared = [each for each in enumerate(closed.rounds) if each[1].comparison.rungs]

@@ -36,8 +36,6 @@ PRIOR_IN_TYPICAL = 50.0
 EQUAL_DEVIANCE = 2.0
 # A fit is skipped as worse if its bound is worse by that, plus this share of its first step's gain for nonlinearity
 NONLINEAR_SHARE = 0.2
-# Number of blocks that the noise model counts for, beside their scatter
-PRIOR_BLOCKS = 30
 # A burst: outliers with neighbours beyond half of that, of at most this share of the recording
 MAX_BURST_SHARE = 0.02
 # Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2)
@@ -116,18 +114,16 @@ class Fit:
         return float(self.system.effective_dof()[6:].sum())
 
     def covariance(self, block: NDArray[np.intp]) -> Array:
-        """Return the covariance (6 + p, 6 + p) from the noise model, enlarged by the scatter of blocks (M,).
+        """Return the covariance (6 + p, 6 + p) from the noise model or from blocks (M,), whichever is larger.
 
         The sandwich H⁻¹ (Σ s sᵀ) H⁻¹ of the blocks' scores s holds whatever colour and level the noise has in a block.
-        It is as uncertain as the blocks are few, so the noise model counts for `PRIOR_BLOCKS` of them.
         """
         inverse = self.system.covariance()
         scores = self.scores(block)
         scores = scores - scores.mean(axis=0)  # prior and own noise make the mean
         n = len(scores)
         sandwich = inverse @ (scores.T @ scores) @ inverse * n / max(n - 1, 1)
-        ratio = (PRIOR_BLOCKS + n * np.diag(sandwich) / np.diag(inverse)) / (PRIOR_BLOCKS + n)
-        grown = np.sqrt(np.maximum(ratio, 1.0))
+        grown = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
         return np.asarray(inverse * np.outer(grown, grown))
 
     def scores(self, block: NDArray[np.intp]) -> Array:

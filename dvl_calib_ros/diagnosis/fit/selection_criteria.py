@@ -22,12 +22,14 @@ from ..model.seen import Seen
 from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
-from .gauss_newton import EQUAL_DEVIANCE, PRIOR_BLOCKS, Fit, Fitter, n_amplitudes, prior_std
+from .gauss_newton import EQUAL_DEVIANCE, Fit, Fitter, n_amplitudes, prior_std
 
 # Parts of the run at whose ends intermittent effects may begin or end
 WINDOW_STEPS = 10
 # Time constant, s, of the slowest noise as an alternative to an effect: GNSS multipath lasts minutes
 SLOWEST_S = 100.0
+# Number of blocks that the noise model counts for in the degrees of freedom of a covariance that it bounds from below
+PRIOR_BLOCKS = 30
 # Simulated residuals of slow noise
 DRAWN = 100
 

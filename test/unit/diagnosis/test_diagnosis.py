@@ -54,7 +54,7 @@ from dvl_calib_ros.diagnosis.search.observable_parameters import (
     without_insignificant,
 )
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
-from dvl_calib_ros.effects.base import ActsOn
+from dvl_calib_ros.effects.base import ActsOn, EffectNeeds
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.recordings.topics import Topics
@@ -67,6 +67,14 @@ pytestmark = pytest.mark.slow
 
 CLAIMS = (DiagnosisVerdict.KNOWN, DiagnosisVerdict.AMBIGUOUS, DiagnosisVerdict.UNKNOWN)
 LEVER = "lever_arm:x_m=-1.9,y_m=0.4,z_m=-0.3"
+
+
+# Effects that one recording at the surface can show
+OF_THE_SURFACE = {
+    name: effect
+    for name, effect in EFFECTS.items()
+    if not effect.relative_to_first and EffectNeeds.DEPTH not in effect.needs
+}
 
 
 def scenario(trajectory="free", effects=(), **changes) -> Scenario:
@@ -253,7 +261,7 @@ def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
     diagnosis = diagnosed()
     assert diagnosis.verdict is DiagnosisVerdict.NO_GAP
     assert diagnosis.effects == () and diagnosis.where == ()
-    assert {"mounting_moved", "sound_speed_moved"} == set(diagnosis.untestable)
+    assert {"mounting_moved", "sound_speed_moved", "sound_speed_layer"} == set(diagnosis.untestable)
     assert set(diagnosis.minimum_detectable) == set(EFFECTS) - set(diagnosis.untestable)
     assert 0.0 < diagnosis.minimum_detectable["lever_arm"]["x_m"] < 0.3
     assert diagnosis.gap.noise_floor == pytest.approx(np.sqrt(3.0) * 0.05, rel=0.1)
@@ -292,7 +300,7 @@ def test_a_turn_that_is_not_shown_and_that_the_mounting_found_has_is_not_left_at
     errors = DvlErrors((0.02, 0.2, 0.01), (0.005,) * 3, beam_std=0.002)
     given = scenario(gnss_std=0.004, waves=Waves(0.06, 6.0), seed=1, dvl_rate=5.0, gnss_rate=5.0, errors=errors)
     recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
-    problem, start, (guess,), _ = started([recording], np.eye(3), np.zeros(3), EFFECTS)
+    problem, start, (guess,), _ = started([recording], np.eye(3), np.zeros(3), OF_THE_SURFACE)
     assert guess.phi[1] == pytest.approx(-0.2, abs=0.05) and np.trace(problem.observable_turns) < 1.5
     np.testing.assert_allclose(problem.observable_turns @ start.phi, start.phi, atol=1e-12)
     assert start.phi[2] == pytest.approx(-0.01, abs=0.02)
@@ -302,8 +310,7 @@ def test_what_is_not_shown_of_an_effect_is_its_where_it_is_named():
     """An error in surge by pitch, a sixth of that in sway by roll, was an unknown cause, and in place of both."""
     given = scenario("box", ["tilt_coupling:x_per_pitch=0.5,y_per_roll=-0.9"], gnss_std=0.01, waves=Waves(0.1, 6.0))
     recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
-    every = {name: each.usual for name, each in EFFECTS.items() if not each.relative_to_first}
-    del every["sound_speed_layer"]  # which needs a dive
+    every = {name: effect.usual for name, effect in OF_THE_SURFACE.items()}
     problem, start, _, testable = started([recording], np.eye(3), np.zeros(3), every)
     tilt = every["tilt_coupling"]
     roll = tilt.without({spec.name for spec in tilt.parameters} - {"y_per_roll"})
@@ -848,7 +855,7 @@ def test_noise_is_no_slower_for_what_columns_explain_of_it_by_their_own():
     arm of 3 m was noise in the next round, and at the end nothing was found."""
     errors = DvlErrors((0.0, 0.0, 0.0), (0.0,) * 3, beam_std=0.012)
     given = scenario("box", gnss_std=0.004, seed=1, dvl_rate=2.0, gnss_rate=5.0, errors=errors, seconds=500.0)
-    every = {name: effect.usual for name, effect in EFFECTS.items() if not effect.relative_to_first}
+    every = {name: effect.usual for name, effect in OF_THE_SURFACE.items()}
     recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
     problem, start, _, _ = started([recording], np.eye(3), np.zeros(3), every)
     fitter = Fitter(problem)
