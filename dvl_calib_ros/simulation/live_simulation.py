@@ -120,6 +120,7 @@ class Follower:
 
 
 def _motion(samples: Iterable[MotionSample]) -> Motion:
+    """Return the motion of samples, in their order."""
     columns = zip(
         *((each.time, each.velocity_body, each.rotation_enu_from_body, each.angular_velocity) for each in samples),
         strict=True,

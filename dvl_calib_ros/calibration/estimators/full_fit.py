@@ -231,7 +231,7 @@ class JointFit:
             raise
 
     def _add(self, day: _Day, block: FitBlock) -> None:
-        """Add a block to its day. Linearise all anew if their number is a power of two, or if the estimate moved."""
+        """Add a block to its day. Linearise all again if their number is a power of two, or if the estimate moved."""
         day.blocks.append(block)
         day.count += 1
         self._forget()
