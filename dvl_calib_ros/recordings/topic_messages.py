@@ -313,9 +313,11 @@ def _velocity_messages(
     difference = FixDifference(window_s, kind.between)
     found = []
     for arrival, log_ns, message in messages:
+        if not kind.is_valid(message):
+            continue
         at_ns = stamped(message, log_ns)
         fixed = difference(at_ns, *kind.place(message), kind.covariance(message))
-        if fixed is not None and kind.is_valid(message):
+        if fixed is not None:
             velocity = SimpleNamespace(**dict(zip("xyz", fixed.velocity, strict=True)))
             seconds, nanoseconds = divmod(fixed.stamp_ns, 1_000_000_000)
             header = SimpleNamespace(

@@ -10,7 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import run, write_bag
 
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.messages.encode import FIX_TYPE, SampleWriter, SatelliteFix
 from dvl_calib_ros.recordings import topic_messages as looking
 from dvl_calib_ros.recordings.recording import hold_the_same, open_recording
 from dvl_calib_ros.recordings.topic_messages import BURST_EVERY_NS, BURST_NS, BURSTS, in_bursts
@@ -88,3 +91,20 @@ def test_of_all_messages_of_a_fast_topic_no_more_are_looked_at_than_frames_need_
     some = recording.whole(topics).previews[topics.imu]
     np.testing.assert_array_equal(some.stamps_s, whole.stamps_s[::step])
     np.testing.assert_array_equal(some.values, whole.values[::step])
+
+
+def test_positions_that_the_receiver_marks_invalid_give_no_velocity_of_a_preview(tmp_path):
+    """Every tenth fix is invalid and kilometres away; the others go north at 1 m/s."""
+    start_ns, every_ns = 1_700_000_000 * 10**9, 200_000_000
+    fixes = [SatelliteFix(start_ns + row * every_ns, 43.0 + row * 0.2 / 111_107.0, 10.0) for row in range(300)]
+    with BagWriter(tmp_path / "valid") as bag:
+        for fix in fixes:
+            SampleWriter(bag).fix("fix", fix)
+    with BagReader([tmp_path / "valid"]) as bag, BagWriter(tmp_path / "bag") as copy:
+        for row, (topic, log_ns, message, _) in enumerate(bag.messages(["fix"])):
+            if row % 10 == 0:
+                message.status.status, message.latitude = -1, 43.1
+            copy.message(topic, FIX_TYPE, log_ns, message)
+    preview = open_recording([tmp_path / "bag"]).survey.previews["fix"]
+    assert len(preview.values) > 100
+    np.testing.assert_allclose(preview.values, np.tile([0.0, 1.0, 0.0], (len(preview.values), 1)), atol=0.01)
