@@ -17,13 +17,13 @@ from ..calibration.numerics.frames import ENU_FROM_NED, Array, Vector
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from ..calibration.streams.imu_frame import ImuAlignment
 from ..verdict.reasons import Reason, finding
-from .drivers import NOT_MEASURED, VelocityType, velocity_type
-from .positions import FixDifference, Place, PositionType, matrix_of
+from .drivers import IMU_TYPE, NOT_MEASURED, VelocityType, velocity_type
+from .positions import FixDifference, Place, PositionType
 
 # counters of physically impossible messages, and of messages in another frame
 INVALID, WRONG_FRAME = "invalid", "wrong_frame"
-# counters of positions without a fix, and without a fix one window earlier
-NO_FIX, FIRST_FIX = "no_fix", "first_fix"
+# counter of positions without a fix one window earlier
+FIRST_FIX = "first_fix"
 # first covariance element of a quantity that an IMU does not measure
 NO_DATA = -1.0
 # value of parameter restamp for every message
@@ -174,15 +174,16 @@ OnFix = Callable[[int, Array, Array], None]
 UNREADABLE = (AttributeError, TypeError, ValueError, IndexError, OverflowError)
 
 
-class _VelocityReader:
+class VelocityReader:
     """Reader of the velocity and its covariance from messages of one type. axes: as in `LinearCovariance`."""
 
-    def __init__(self, kind: VelocityType, axes: Axes) -> None:
+    def __init__(self, kind: VelocityType, axes: Axes = AS_SENT) -> None:
         self._velocity, self._given, self._lacks = kind.velocity, kind.covariance, kind.lacks_covariance
         self._covariance = LinearCovariance(axes)
         self._axes = axes
 
     def __call__(self, message: Any) -> tuple[Vector, Array | None]:
+        """Return the vector, m/s or a position, and its covariance (3, 3), None if not given."""
         velocity = self._velocity(message)
         covariance = None if self._lacks(message) else self._covariance(self._given(message))
         if self._axes is AS_SENT:
@@ -219,7 +220,7 @@ class MessageDecoder:
         self.dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         self.reference_type = velocity_type("gnss_type", parameters.gnss_type)
         self.imu_alignment = ImuAlignment(parameters)
-        self._reference_readers: dict[Axes, _VelocityReader] = {}
+        self._reference_readers: dict[Axes, VelocityReader] = {}
         self.adapted = {"dvl/twist": self.dvl_type.adapted, "gnss/twist": self.reference_type.adapted}
         self._on_problem = on_problem
         self.on_fix: OnFix = lambda *_: None
@@ -230,11 +231,11 @@ class MessageDecoder:
         self.problems: dict[str, Reason] = {}
         self.zero_stamps = 0
         self.dvl_frame: str | None = self.parameters.dvl_frame or None
-        self._dvl_reader: _VelocityReader | None = None
+        self._dvl_reader: VelocityReader | None = None
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, DeclaredFrame | None] = {}
         position = self.reference_type.position
-        self._fixes = FixDifference(self.parameters.position_window, None if position is None else position.between)
+        self.fixes = FixDifference(self.parameters.position_window, None if position is None else position.between)
         self._origin: Place | None = None
 
     def dvl(self, message: Any, received_ns: int) -> DvlSample | Refusal:
@@ -244,10 +245,10 @@ class MessageDecoder:
             if not self.accepts_dvl_frame(kind.frame_id(message)):
                 return Refusal(WRONG_FRAME)
             broken = kind.broken_rule(message, self.parameters)
-            if broken is not None:
-                return Refusal(broken.counter)
+            if broken:
+                return Refusal(kind.rules[broken - 1].counter)
             if self._dvl_reader is None:
-                self._dvl_reader = _VelocityReader(kind, HALF_TURN if self.turns_dvl else AS_SENT)
+                self._dvl_reader = VelocityReader(kind, HALF_TURN if self.turns_dvl else AS_SENT)
                 self.note_axes()
             velocity, covariance = self._dvl_reader(message)
             stamp = self._stamp_ns(Stream.DVL, message.header, received_ns)
@@ -263,29 +264,35 @@ class MessageDecoder:
             if frame is None:
                 return Refusal(WRONG_FRAME)
             stamp = self._stamp_ns(Stream.REFERENCE, message.header, received_ns)
+            broken = 0 if kind.position is None else kind.broken_rule(message, self.parameters)
+            if broken:
+                return Refusal(kind.rules[broken - 1].counter)
+            axes = frame.axes if kind.position is None else AS_SENT
+            if axes not in self._reference_readers:
+                self._reference_readers[axes] = VelocityReader(kind, axes)
+            values, covariance = self._reference_readers[axes](message)
             if kind.position is not None:
-                return self._difference(kind.position, message, stamp, frame.frame)
-            if frame.axes not in self._reference_readers:
-                self._reference_readers[frame.axes] = _VelocityReader(kind, frame.axes)
-            velocity, covariance = self._reference_readers[frame.axes](message)
+                return self._difference(stamp, values, covariance, frame.frame)
         except UNREADABLE as error:
             return self.undecodable(Stream.REFERENCE, f"{kind.name}, {type(error).__name__}: {error}")
-        return ReferenceSample(stamp, velocity, covariance, frame.frame)
+        return ReferenceSample(stamp, values, covariance, frame.frame)
 
     def _difference(
-        self, kind: PositionType, message: Any, stamp_ns: int, frame: VelocityFrame
+        self, stamp_ns: int, place: Place, covariance: Array | None, frame: VelocityFrame
     ) -> ReferenceSample | Refusal:
-        """Return the velocity between a position and the one a window earlier; the position itself goes to `on_fix`."""
-        if not kind.is_valid(message):
-            return Refusal(NO_FIX)
-        place, covariance = kind.place(message), kind.covariance(message)
-        if frame is not VelocityFrame.BODY and math.isfinite(sum(place)):
-            self._origin = self._origin or place
-            self.on_fix(stamp_ns, *_east_north_up(kind, self._origin, place, covariance, frame))
-        mean = self._fixes(stamp_ns, *place, covariance)
+        """Return the velocity between a position and the one a window earlier."""
+        self.note_fix(stamp_ns, place, covariance, frame)
+        mean = self.fixes(stamp_ns, *place, covariance)
         if mean is None:
             return Refusal(FIRST_FIX)
         return ReferenceSample(mean.stamp_ns, mean.velocity, mean.covariance, frame)
+
+    def note_fix(self, stamp_ns: int, place: Place, covariance: Array | None, frame: VelocityFrame) -> None:
+        """Give a valid position to `on_fix`."""
+        kind = self.reference_type.position
+        if kind is not None and frame is not VelocityFrame.BODY and math.isfinite(sum(place)):
+            self._origin = self._origin or place
+            self.on_fix(stamp_ns, *_east_north_up(kind, self._origin, place, covariance, frame))
 
     def imu(self, message: Any, received_ns: int) -> ImuSample | Refusal:
         """Decode a sensor_msgs/Imu. A covariance that starts with -1 means that the quantity is missing.
@@ -301,7 +308,7 @@ class MessageDecoder:
                 None if message.angular_velocity_covariance[0] == NO_DATA else (w.x, w.y, w.z),
             )
         except UNREADABLE as error:
-            return self.undecodable(Stream.IMU, f"{type(error).__name__}: {error}")
+            return self.undecodable(Stream.IMU, f"{IMU_TYPE}, {type(error).__name__}: {error}")
         return self.imu_alignment.sample(sample)
 
     def undecodable(self, stream: Stream, reason: str) -> Refusal:
@@ -394,11 +401,11 @@ class MessageDecoder:
 
 
 def _east_north_up(
-    kind: PositionType, origin: Place, place: Place, covariance: Any, frame: VelocityFrame
+    kind: PositionType, origin: Place, place: Place, covariance: Array | None, frame: VelocityFrame
 ) -> tuple[Array, Array]:
     """Return a position (3,) m from the origin, and its variances (3,) m², nan if unknown."""
-    away, matrix = np.array(kind.between(origin, place)), matrix_of(covariance)
-    variance = np.full(3, math.nan) if matrix is None else np.diag(matrix).copy()
+    away = np.array(kind.between(origin, place))
+    variance = np.full(3, math.nan) if covariance is None else np.diag(covariance).copy()
     if frame is VelocityFrame.NED:
         away, variance = ENU_FROM_NED @ away, variance[[1, 0, 2]]
     variance[~((variance > 0.0) & (variance < NOT_MEASURED))] = math.nan

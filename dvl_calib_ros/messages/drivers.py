@@ -86,16 +86,15 @@ class Rule(NamedTuple):
 class VelocityType:
     """One message type.
 
-    velocity: message -> object with x, y, z, m/s.
-    covariance: message -> covariance of that velocity, row-major, 9 numbers or 36 of a twist, (m/s)²; None if not
-      given.
+    velocity: message -> object with x, y, z, m/s; of a type of positions the position.
+    covariance: message -> covariance of that vector, row-major, 9 numbers or 36 of a twist or pose; None if not given.
     lacks_covariance: message -> whether the field is a placeholder.
     frame_id: message -> frame of the velocity.
     is_read_in_columns: whether these functions also work on columns of messages, which needs a type without lists.
     points_down: forward-right-down unless the frame's name says otherwise.
-    rules: of a DVL; the first broken one counts.
+    rules: of a DVL, or of positions; the first broken one counts.
     is_reference, is_dvl: whether references and DVLs use this type.
-    position: how to read positions (positions.py), None for a type of velocities.
+    position: properties of positions (positions.py), None for a type of velocities.
     reference_frame: axes of a reference in this type regardless of frame_id; None to use frame_id.
     adapted: conversion of a message without header; None if not needed.
     definitions: versions of the definition, for bags without.
@@ -126,12 +125,9 @@ class VelocityType:
         suffix = frame_id.lower().rpartition("_")[2]
         return suffix == "frd" or (self.points_down and suffix != "flu")
 
-    def broken_rule(self, message: Any, parameters: Parameters) -> Rule | None:
-        """Return the first rule that a message breaks."""
-        for rule in self.rules:
-            if rule.broken(message, parameters):
-                return rule
-        return None
+    def broken_rule(self, message: Any, parameters: Parameters) -> int:
+        """Return 1 + index of the first rule that a message breaks; 0 if none."""
+        return next((code for code, rule in enumerate(self.rules, start=1) if rule.broken(message, parameters)), 0)
 
     def advice(self, counts: Mapping[str, int]) -> list[Reason]:
         """Return findings on the messages refused by rules; counts: `Calibrator.counts` of the DVL."""
@@ -206,18 +202,18 @@ def _dvl_msgs_covariance(message: Any) -> Any:
     return None if message.fom == 0.0 else np.diag([message.fom**2] * 3)
 
 
-class _Velocity(NamedTuple):
-    """Velocity of a message without a vector, m/s."""
+class _Vector(NamedTuple):
+    """Velocity or position of a message without a vector; numbers, or columns of them."""
 
-    x: float
-    y: float
-    z: float
+    x: Any
+    y: Any
+    z: Any
 
 
-def _course_and_speed(message: Any) -> _Velocity:
+def _course_and_speed(message: Any) -> _Vector:
     """Return east, north, up from course over ground (degrees from north), speed and climb."""
     course = math.radians(message.track)
-    return _Velocity(message.speed * math.sin(course), message.speed * math.cos(course), message.climb)
+    return _Vector(message.speed * math.sin(course), message.speed * math.cos(course), message.climb)
 
 
 def _speed_covariance(message: Any) -> Any:
@@ -228,8 +224,14 @@ def _speed_covariance(message: Any) -> Any:
     return np.diag([across**2, across**2, up**2 if up > 0.0 else NOT_MEASURED])
 
 
-def _no_velocity(message: Any) -> Any:
-    raise ValueError("a position is no velocity")  # MessageDecoder computes a velocity from two positions
+def pose_of(message: Any) -> Any:
+    """Return the pose of a message, with or without covariance."""
+    return getattr(message.pose, "pose", message.pose)
+
+
+def _lacks_pose_covariance(message: Any) -> Any:
+    covariance = np.asarray(message.pose.covariance)
+    return (covariance[..., 0] <= 0.0) | (covariance[..., 7] <= 0.0)
 
 
 _LINEAR, _TWIST_LINEAR, _VELOCITY = map(attrgetter, ("twist.linear", "twist.twist.linear", "velocity"))
@@ -292,6 +294,12 @@ _FEW_BEAMS = Rule(
     f"`num_good_beams` below {ENOUGH_BEAMS}",
     lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
     CHECK_LOCK,
+)
+_NO_FIX = Rule(
+    "no_fix",
+    "`status.status` is negative",
+    lambda message, _: message.status.status < 0,
+    "check that nothing covers the antenna",
 )
 
 # extended by recognised types (field_map.py)
@@ -446,17 +454,24 @@ VELOCITY_TYPES: dict[str, VelocityType] = {
         _reference_alone(
             name=POSE_TYPES[0],
             sent_by="acoustic positioning (USBL), motion capture",
-            velocity=_no_velocity,
+            velocity=attrgetter("pose.pose.position"),
+            covariance=attrgetter("pose.covariance"),
+            lacks_covariance=_lacks_pose_covariance,
             covariance_says="of the difference of two positions, from `pose.covariance`; zero: not given",
             position=POSE,
         ),
-        _reference_alone(name=POSE_TYPES[1], sent_by="motion capture", velocity=_no_velocity, position=POSE),
+        _reference_alone(
+            name=POSE_TYPES[1], sent_by="motion capture", velocity=attrgetter("pose.position"), position=POSE
+        ),
         _reference_alone(
             name="sensor_msgs/msg/NavSatFix",
             sent_by="receivers that give positions alone (RTK)",
-            velocity=_no_velocity,
+            velocity=lambda message: _Vector(message.latitude, message.longitude, message.altitude),
+            covariance=attrgetter("position_covariance"),
+            lacks_covariance=lambda message: message.position_covariance_type == 0,
             covariance_says="of the difference of two positions, from `position_covariance`",
             frame_says="east-north-up",
+            rules=(_NO_FIX,),
             position=SATELLITES,
             reference_frame=VelocityFrame.ENU,
         ),

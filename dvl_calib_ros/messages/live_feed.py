@@ -144,17 +144,16 @@ class DecodedMessages(RowTable):
         if isinstance(decoded, ReferenceSample):
             self.frames[at] = FRAME_CODES[decoded.frame]
 
-    def block(self, stream: Stream, arrival: Stamps | None = None) -> SampleBlock:
-        """Return all samples of one stream. arrival: of all messages; their order by default."""
+    def block(self, stream: Stream) -> SampleBlock:
+        """Return all samples of one stream."""
         (rows,) = np.nonzero(self.stream[: self.size] == _CODES[stream])
         has_covariance = self.has_covariance[rows]
         given = Covariances.of(self.covariance[rows[has_covariance]], int(has_covariance.sum()))
         index = np.full(len(rows), -1, dtype=np.intp)
         index[has_covariance] = given.index
-        arrival = rows if arrival is None else arrival
         return sample_block(
             stream, self.stamps_ns[rows], self.values[rows, : WIDTH[stream]],
-            covariance=Covariances(given.distinct, index), frames=self.frames[rows], arrival=arrival,
+            covariance=Covariances(given.distinct, index), frames=self.frames[rows], arrival=rows,
             refused=self.refused[rows], reasons=self._reasons,
         )  # fmt: skip
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
+from collections.abc import Callable
+from typing import NamedTuple
 
 from ..calibration.numerics.frames import Array, Vector
 
@@ -38,18 +36,12 @@ Place = tuple[float, float, float]
 
 
 class PositionType(NamedTuple):
-    """Functions that read positions from messages of a type.
+    """Properties of the positions of a type.
 
-    is_valid: message -> whether it has a position.
-    place: message -> three numbers.
-    covariance: message -> of east, north, up, 9 numbers or 36 of a pose, m²; None if not given.
     between: two places -> vector from one to the other, m.
     has_height: whether the vertical is as accurate as the horizontal.
     """
 
-    is_valid: Callable[[Any], bool]
-    place: Callable[[Any], Place]
-    covariance: Callable[[Any], Sequence[float] | Array | None]
     between: Callable[[Place, Place], Vector]
     has_height: bool
 
@@ -72,14 +64,12 @@ class FixDifference:
         self._between = between or east_north_up
         self._fixes: deque[_Fix] = deque(maxlen=MOST_FIXES)
 
-    def __call__(
-        self, stamp_ns: int, x: float, y: float, z: float, covariance: Sequence[float] | Array | None
-    ) -> FixedVelocity | None:
+    def __call__(self, stamp_ns: int, x: float, y: float, z: float, covariance: Array | None) -> FixedVelocity | None:
         """Return the velocity of the window that ends with this fix; None until there is a position one window earlier.
 
-        x, y, z: position. covariance: as in `PositionType`.
+        x, y, z: position. covariance: (3, 3) m², None if not given.
         """
-        fix = _Fix(stamp_ns, (x, y, z), matrix_of(covariance))
+        fix = _Fix(stamp_ns, (x, y, z), covariance)
         fixes = self._fixes
         if fixes and stamp_ns <= fixes[-1].stamp_ns:
             fixes.clear()  # a clock set back, or a loop
@@ -106,14 +96,6 @@ class FixDifference:
         return FixedVelocity(middle_ns, (east / seconds, north / seconds, up / seconds), noise)
 
 
-def matrix_of(covariance: Sequence[float] | Array | None) -> Array | None:
-    """Return (3, 3) m² from a covariance of 9 numbers or a pose's of 36; None for None."""
-    if covariance is None:
-        return None
-    given = np.asarray(covariance, dtype=float)
-    return given.reshape(6, 6)[:3, :3] if given.size == 36 else given.reshape(3, 3)
-
-
 def east_north_up(start: Place, end: Place) -> Vector:
     """Return the vector from one position to another nearby, m, on the tangent plane of the ellipsoid between them."""
     (start_deg, start_longitude_deg, start_m), (end_deg, end_longitude_deg, end_m) = start, end
@@ -135,26 +117,5 @@ def straight(start: Place, end: Place) -> Vector:
     return end[0] - start[0], end[1] - start[1], end[2] - start[2]
 
 
-def _of_pose(message: Any) -> Place:
-    position = getattr(message.pose, "pose", message.pose).position
-    return position.x, position.y, position.z
-
-
-def _pose_covariance(message: Any) -> Any:
-    """Return the covariance (36,) of a pose; None if missing or not positive."""
-    if not hasattr(message.pose, "covariance"):
-        return None
-    given = np.asarray(message.pose.covariance, dtype=float)
-    return None if given[0] <= 0.0 or given[7] <= 0.0 else given
-
-
-SATELLITES = PositionType(
-    is_valid=lambda message: message.status.status >= 0,
-    place=lambda message: (message.latitude, message.longitude, message.altitude),
-    covariance=lambda message: message.position_covariance if message.position_covariance_type else None,
-    between=east_north_up,
-    has_height=False,
-)
-POSE = PositionType(
-    is_valid=lambda _: True, place=_of_pose, covariance=_pose_covariance, between=straight, has_height=True
-)
+SATELLITES = PositionType(between=east_north_up, has_height=False)
+POSE = PositionType(between=straight, has_height=True)

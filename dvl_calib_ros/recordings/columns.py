@@ -1,4 +1,4 @@
-"""Storage of a topic's messages: columns if the layout is fixed, else bytes.
+"""Storage of a topic's messages as columns.
 
 Values and stamps are stored unchanged, because frames and parameters are known only later.
 """
@@ -7,42 +7,44 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bags.channels import Channel, Decoder, DecodingError
 from ..bags.columns import MessageColumns, Part
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Codes, Covariances, Index, Mask, Stamps
-from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance, stamp_ns
-from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
+from ..messages.decode import NO_DATA, UNREADABLE, VelocityReader, frame_name, heading_variance, stamp_ns
+from ..messages.drivers import IMU_TYPE, POSE_TYPES, VELOCITY_TYPES, VelocityType, pose_of
+from ..messages.positions import FixDifference
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 @dataclass(frozen=True)
-class DecodedRows:
-    """N messages of a fixed layout, decoded together, in order of arrival.
+class TopicColumns:
+    """N messages of a topic in one recording, in order of arrival.
 
     arrival: (N,) positions among all messages read.
     log_ns: (N,).
     stamps_ns: (N,) of the header, 0 if missing.
-    values: (N, 3) velocity, m/s, in the message's axes; of an IMU (N, 7) quaternion (x, y, z, w) and angular velocity,
-      rad/s, nan if missing.
-    frame: (N,) indices into frames, the frame_ids.
-    covariance: (N,) indices into distinct (C, 3, 3), (m/s)², -1 if missing.
+    values: (N, 3) velocity, m/s, in the message's axes, or the position of a type of positions; of an IMU (N, 7)
+      quaternion (x, y, z, w) and angular velocity, rad/s, nan if missing.
+    frame: (N,) indices into frames, the frame_ids; of a message that cannot be read -1 minus an index into unread, the
+      reasons.
+    covariance: (N,) indices into distinct (C, 3, 3), (m/s)² or m², -1 if missing.
     broken: (N,) 1 + index of the first violated rule of the message type, 0 if none.
     extra: (N, 3) acceleration, m/s², of an IMU; else as `extra_values`.
     world: frame_id of the first message's header, which is the pose's frame for an odometry.
     heading_variance: of an IMU's orientation about z, rad², of the first message; nan if missing.
     """
 
+    topic: str
+    msgtype: str
     arrival: Stamps
     log_ns: Stamps
     stamps_ns: Stamps
@@ -54,14 +56,30 @@ class DecodedRows:
     world: str = ""
     heading_variance: float = math.nan
     frames: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
     distinct: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
     def __len__(self) -> int:
         return len(self.arrival)
 
-    def part(self, at: slice | Index) -> DecodedRows:
-        """Return the rows of a slice or of indices."""
+    def part(self, at: slice | Index | Mask) -> TopicColumns:
+        """Return the rows of a slice, of indices or of a mask."""
         return replace(self, **{name: getattr(self, name)[at] for name in _DTYPES})
+
+    @property
+    def readable(self) -> TopicColumns:
+        """Messages that could be read."""
+        return self.part(self.frame >= 0) if self.unread else self
+
+    @property
+    def unread_reasons(self) -> list[str]:
+        """Reasons why messages could not be read, one per message, in order."""
+        return [self.unread[-1 - place] for place in self.frame[self.frame < 0].tolist()] if self.unread else []
+
+    @property
+    def stamped_ns(self) -> Stamps:
+        """Stamps (N,), the log time if missing."""
+        return self.stamps_ns if self.stamps_ns.all() else np.where(self.stamps_ns == 0, self.log_ns, self.stamps_ns)
 
     @property
     def covariances(self) -> Covariances:
@@ -74,13 +92,18 @@ class DecodedRows:
         return Covariances(self.distinct[first : last + 1], index)
 
     @property
+    def diagonals(self) -> Array:
+        """Diagonals (N, 3) of the covariances, nan if missing."""
+        diagonals = np.full((len(self), 3), np.nan)
+        given = self.covariance >= 0
+        diagonals[given] = np.diagonal(self.distinct, axis1=1, axis2=2)[self.covariance[given]]
+        return diagonals
+
+    @property
     def variances(self) -> Array:
         """Variances (N, 3) (m/s)², nan if missing or if one of them is not a valid variance."""
-        variances = np.full((len(self), 3), np.nan)
-        given = self.covariance >= 0
-        if given.any():
-            variances[given] = np.diagonal(self.distinct, axis1=1, axis2=2)[self.covariance[given]]
-            variances[(variances <= 0.0).any(axis=1)] = np.nan
+        variances = self.diagonals
+        variances[(variances <= 0.0).any(axis=1)] = np.nan
         return variances
 
 
@@ -90,149 +113,56 @@ _DTYPES: Mapping[str, Any] = {
 }  # fmt: skip
 
 
-# bytes up to the end of a header's stamp: encoding, seconds and nanoseconds
-STAMP_END = 12
+def joined(parts: Sequence[TopicColumns]) -> TopicColumns:
+    """Return the messages of a topic in several recordings, in order of arrival."""
+    if len(parts) == 1:
+        return parts[0]
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _DTYPES}
+    frames = np.cumsum([0, *(len(part.frames) for part in parts)]).tolist()
+    unread = np.cumsum([0, *(len(part.unread) for part in parts)]).tolist()
+    columns["frame"] = np.concatenate(
+        [
+            np.where(part.frame < 0, part.frame - n_unread, part.frame + n_frames)
+            for part, n_frames, n_unread in zip(parts, frames, unread, strict=False)
+        ]
+    )
+    covariances = parts[0].covariances.joined(*(part.covariances for part in parts[1:]))
+    whole = replace(
+        parts[0], **columns | {"covariance": covariances.index}, distinct=covariances.distinct,
+        world=next((part.world for part in parts if part.world), ""),
+        heading_variance=next((part.heading_variance for part in parts if part.heading_variance > 0.0), math.nan),
+        frames=tuple(name for part in parts for name in part.frames),
+        unread=tuple(reason for part in parts for reason in part.unread),
+    )  # fmt: skip
+    return whole.part(np.argsort(whole.arrival, kind="stable"))
 
 
-@dataclass(frozen=True)
-class Singles:
-    """M messages that are decoded individually, in order of arrival.
+def differenced(positions: TopicColumns, difference: FixDifference) -> TopicColumns:
+    """Return valid positions as velocities between them, at the middle of their windows.
 
-    arrival, log_ns: (M,).
-    channel: (M,) indices into channels.
-    end: (M,) end of each message in content, which is bytes.
-    is_restamped: whether log times replace the stamps.
+    A valid position that ends no window counts as breaking one more rule than its type has.
     """
-
-    arrival: Stamps
-    log_ns: Stamps
-    channel: NDArray[np.int32]
-    end: Stamps
-    content: Codes
-    channels: tuple[Channel, ...]
-    decoder: Decoder
-    is_restamped: bool = False
-
-    def __len__(self) -> int:
-        return len(self.arrival)
-
-    def messages(self, at: slice | Index = slice(None)) -> Iterator[tuple[int, int, Any, str]]:
-        """Yield arrival, log time (ns), message (None if it cannot be decoded) and the reason for None."""
-        places = np.arange(len(self))[at]
-        starts = np.where(places > 0, self.end[places - 1], 0) if len(places) else places
-        rows = zip(
-            self.arrival[places].tolist(), self.log_ns[places].tolist(), self.channel[places].tolist(),
-            starts.tolist(), self.end[places].tolist(), strict=True,
-        )  # fmt: skip
-        for arrival, log_ns, channel, start, end in rows:
-            kind = VELOCITY_TYPES.get(self.channels[channel].msgtype)
-            try:
-                message = self.decoder(self.channels[channel], self.content[start:end].tobytes())
-                message = message if kind is None or kind.adapted is None else kind.adapted(message)
-                if self.is_restamped:
-                    seconds, nanoseconds = divmod(log_ns, 1_000_000_000)
-                    message.header.stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
-                yield arrival, log_ns, message, ""
-            except DecodingError as error:
-                yield arrival, log_ns, None, str(error)
-
-    def part(self, at: Index) -> Singles:
-        """Return the rows of indices."""
-        starts = np.concatenate([[0], self.end[:-1]])[at]
-        lengths = self.end[at] - starts
-        end = np.cumsum(lengths)
-        content = self.content[np.repeat(starts - (end - lengths), lengths) + np.arange(int(lengths.sum()))]
-        return replace(
-            self, arrival=self.arrival[at], log_ns=self.log_ns[at], channel=self.channel[at], end=end, content=content
-        )
-
-    @property
-    def stamps_ns(self) -> Stamps:
-        """Header stamps (M,), 0 if missing or if a message cannot be decoded."""
-        if self.is_restamped:
-            return self.log_ns
-        stamps_ns = np.zeros(len(self), dtype=np.int64)
-        for number, channel in enumerate(self.channels):
-            of_channel = np.flatnonzero(self.channel == number)
-            kind = VELOCITY_TYPES.get(channel.msgtype)
-            if kind is not None and kind.adapted is not None:  # a message without header
-                messages = (message for _, _, message, _ in self.messages(of_channel))
-                stamps_ns[of_channel] = [0 if each is None else stamp_ns(each.header.stamp) for each in messages]
-            else:
-                stamps_ns[of_channel] = self._header_stamps_ns(of_channel)
-        return stamps_ns
-
-    def _header_stamps_ns(self, rows: Index) -> Stamps:
-        """Read only the stamps of messages that begin with a header, from their bytes (CDR).
-
-        Byte 0 is 0 and byte 1 the byte order; after the 4 bytes of this encapsulation follow seconds and nanoseconds.
-        """
-        starts = np.where(rows > 0, self.end[rows - 1], 0)
-        is_whole = self.end[rows] - starts >= STAMP_END
-        head = self.content[np.where(is_whole, starts, 0)[:, None] + np.arange(STAMP_END if is_whole.any() else 0)]
-        stamps_ns = np.zeros(len(rows), dtype=np.int64)
-        for byte_order, flag in (("<", 1), (">", 0)):
-            readable = is_whole & ((head[:, :1] == 0) & (head[:, 1:2] == flag)).any(axis=1)
-            seconds, nanoseconds = (
-                np.ascontiguousarray(head[readable, first : first + 4])
-                .view(f"{byte_order}{kind}4")
-                .astype(np.int64)
-                .ravel()
-                for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))
-            )
-            stamps_ns[readable] = seconds * 1_000_000_000 + nanoseconds
-        return stamps_ns
+    rows = zip(
+        positions.stamped_ns.tolist(), *positions.values.T.tolist(), positions.covariances.matrices,
+        positions.broken.tolist(), strict=True,
+    )  # fmt: skip
+    found = [None if broken else difference(*fix) for *fix, broken in rows]
+    known = np.array([fixed is not None for fixed in found], dtype=bool)
+    fixes = [fixed for fixed in found if fixed is not None]
+    covariances = Covariances.of_matrices([None if fixed is None else fixed.covariance for fixed in found])
+    stamps_ns, values = positions.stamped_ns.copy(), np.full((len(positions), 3), np.nan)
+    stamps_ns[known] = [fixed.stamp_ns for fixed in fixes]
+    values[known] = np.array([fixed.velocity for fixed in fixes]).reshape(-1, 3)
+    first = np.uint8(1 + len(VELOCITY_TYPES[positions.msgtype].rules))
+    return replace(
+        positions, stamps_ns=stamps_ns, values=values, extra=np.full_like(values, np.nan),
+        broken=np.where(known | (positions.broken > 0), positions.broken, first),
+        covariance=covariances.index.astype(np.int32), distinct=covariances.distinct,
+    )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class TopicColumns:
-    """All messages of a topic in one recording."""
-
-    topic: str
-    msgtype: str
-    decoded: DecodedRows
-    singles: Singles
-
-    def __len__(self) -> int:
-        return len(self.decoded) + len(self.singles)
-
-    @property
-    def arrivals(self) -> tuple[Stamps, Stamps]:
-        """Positions of all messages among all messages read, in order, and their log times (ns)."""
-        if not len(self.singles):
-            return self.decoded.arrival, self.decoded.log_ns
-        arrival = np.concatenate([self.decoded.arrival, self.singles.arrival])
-        order = np.argsort(arrival, kind="stable")
-        return arrival[order], np.concatenate([self.decoded.log_ns, self.singles.log_ns])[order]
-
-    @property
-    def stamps_ns(self) -> Stamps:
-        """Stamps of all messages in the order of `arrivals`; the log time if missing."""
-        _, log_ns = self.arrivals
-        stamps_ns: Stamps = self.decoded.stamps_ns
-        if len(self.singles):
-            order = np.argsort(np.concatenate([self.decoded.arrival, self.singles.arrival]), kind="stable")
-            stamps_ns = np.concatenate([stamps_ns, self.singles.stamps_ns])[order]
-        return stamps_ns if stamps_ns.all() else np.where(stamps_ns == 0, log_ns, stamps_ns)
-
-    def restamped(self) -> TopicColumns:
-        """Return the messages stamped by log time."""
-        decoded = replace(self.decoded, stamps_ns=self.decoded.log_ns)
-        return replace(self, decoded=decoded, singles=replace(self.singles, is_restamped=True))
-
-    def part(self, kept: Mask) -> TopicColumns:
-        """Return the messages of a mask (N,), in the order of `arrivals`."""
-        arrival = self.arrivals[0][kept]
-        decoded, singles = (np.flatnonzero(np.isin(part.arrival, arrival)) for part in (self.decoded, self.singles))
-        return replace(self, decoded=self.decoded.part(decoded), singles=self.singles.part(singles))
-
-    def arriving(self, renumbered: Callable[[Stamps], Stamps]) -> TopicColumns:
-        """Return the messages with renumbered arrivals."""
-        return replace(
-            self,
-            decoded=replace(self.decoded, arrival=renumbered(self.decoded.arrival)),
-            singles=replace(self.singles, arrival=renumbered(self.singles.arrival)),
-        )
+Row = tuple[np.int64, Array, int, Array | None, int, Array]
+"""Stamp, values, frame, covariance, code of the broken rule and additional values of a message."""
 
 
 def is_kept(msgtype: str) -> bool:
@@ -243,23 +173,20 @@ def is_kept(msgtype: str) -> bool:
 class Collector:
     """Collector of a topic's messages. expected: number of messages. parameters: for the type's validity rules."""
 
-    def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
+    def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters) -> None:
         """Reserve the columns. expected: number of messages. parameters: for the validity rules of the message type."""
-        self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
-        shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "extra": (extra_width(msgtype),)}
-        self._laid = {name: GrowingRows(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
+        self._topic, self._msgtype, self._parameters = topic, msgtype, parameters
+        self._kind = VELOCITY_TYPES.get(msgtype)
+        self._velocity = None if self._kind is None else VelocityReader(self._kind)
+        shapes = {"values": (7 if self._kind is None else 3,), "extra": (extra_width(msgtype),)}
+        self._columns = {name: GrowingRows(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
+        self._nothing = np.full(shapes["values"], np.nan), np.full(shapes["extra"], np.nan)
         self._world = ""
         self._heading_variance = math.nan
-        self._frames: dict[bytes, int] = {}
+        self._frames: dict[str, int] = {}
+        self._unread: dict[str, int] = {}
         self._distinct: list[Array] = []
         self._n_distinct = 0
-        self._singles = {
-            name: GrowingRows(dtype)
-            for name, dtype in (("arrival", np.int64), ("log_ns", np.int64), ("channel", np.int32), ("end", np.int64),
-                                ("content", np.uint8))
-        }  # fmt: skip
-        self._bytes = 0
-        self._channels: dict[Channel, int] = {}
 
     def take(self, part: Part) -> None:
         """Add the next messages of one channel."""
@@ -274,7 +201,7 @@ class Collector:
         columns = part.columns
         if columns is None:
             raise ValueError("not laid out alike")
-        kind = VELOCITY_TYPES.get(self._msgtype)
+        kind = self._kind
         frame_ids = columns.header.frame_id if kind is None else kind.frame_id(columns)
         stamp = columns.header.stamp
         stamps_ns = stamp.sec.astype(np.int64) * 1_000_000_000 + stamp.nanosec
@@ -282,59 +209,92 @@ class Collector:
         covariances, broken = Covariances.none(n), np.zeros(n, dtype=np.uint8)
         if kind is None:
             values, extra = _imu(columns)
-            if math.isnan(self._heading_variance):
-                self._heading_variance = heading_variance(columns.orientation_covariance[0])
         else:
-            velocity = kind.velocity(columns)
-            values, extra = _columns_of(velocity), extra_values(columns, self._msgtype)
+            values, extra = _columns_of(kind.velocity(columns)), extra_values(columns, self._msgtype)
             extra = np.broadcast_to(extra, (n, extra.shape[1]))
             covariances = _covariances(kind, columns)
             broken = _broken(kind, columns, self._parameters)
-        self._world = self._world or frame_name(columns.header.frame_id[0].tobytes().decode("ascii"))
+        world = columns.header.frame_id[0].tobytes().decode("ascii")
         # nothing is stored before everything is known to be readable
+        self._note_first(world, None if kind else columns.orientation_covariance[0])
+        self._store(part, stamps_ns, values, self._frames_of(frame_ids), covariances, broken, extra)
+
+    def _store(
+        self, part: Part, stamps_ns: Any, values: Any, frame: Any, covariances: Covariances, broken: Any, extra: Any
+    ) -> None:
+        """Store the columns of a part."""
         index = np.where(covariances.index < 0, -1, covariances.index + self._n_distinct)
         if len(covariances.distinct):
             self._distinct.append(covariances.distinct)
             self._n_distinct += len(covariances.distinct)
-        rows = (part.arrival, part.log_ns, stamps_ns, values, self._frame(frame_ids), index, broken, extra)
-        for column, each in zip(self._laid.values(), rows, strict=True):
+        rows = (part.arrival, part.log_ns, stamps_ns, values, frame, index, broken, extra)
+        for column, each in zip(self._columns.values(), rows, strict=True):
             column.add(each)
 
-    def _frame(self, frame_ids: Any) -> Index:
+    def _note_first(self, world: str, orientation_covariance: Any) -> None:
+        """Keep the frame_id of the first header and an IMU's first heading variance."""
+        self._world = self._world or frame_name(world)
+        if self._kind is None and math.isnan(self._heading_variance):
+            self._heading_variance = heading_variance(orientation_covariance)
+
+    def _frames_of(self, frame_ids: Any) -> Index:
         """Return the frame's index of each row of (N, length) ASCII."""
         n = len(frame_ids)
         if not frame_ids.shape[1] or (frame_ids == frame_ids[0]).all():
-            return np.full(n, self._frames.setdefault(frame_ids[0].tobytes(), len(self._frames)))
-        return np.array([self._frames.setdefault(row.tobytes(), len(self._frames)) for row in frame_ids])
+            return np.full(n, self._frame(frame_ids[0].tobytes().decode("ascii")))
+        return np.array([self._frame(row.tobytes().decode("ascii")) for row in frame_ids])
+
+    def _frame(self, name: str) -> int:
+        return self._frames.setdefault(frame_name(name), len(self._frames))
 
     def _take_singly(self, part: Part) -> None:
-        """Keep the bytes of messages that have no common layout."""
-        data = list(part.data())
-        end = self._bytes + np.cumsum([len(message) for message in data], dtype=np.int64)
-        self._bytes = int(end[-1])
-        channel = np.full(len(data), self._channels.setdefault(part.channel, len(self._channels)))
-        content = np.frombuffer(b"".join(data), dtype=np.uint8)
-        for column, values in zip(
-            self._singles.values(), (part.arrival, part.log_ns, channel, end, content), strict=True
-        ):
-            column.add(values)
+        """Store messages that have no common layout, decoded individually."""
+        rows = [self._row(message, why) for message, why in part.messages()]
+        stamps_ns, values, frame, matrices, broken, extra = zip(*rows, strict=True)
+        self._store(part, stamps_ns, values, frame, Covariances.of_matrices(matrices), broken, extra)
+
+    def _row(self, message: Any, why: str) -> Row:
+        """Return the row of a message. message: None if it cannot be decoded. why: the reason."""
+        if message is not None:
+            try:
+                return self._read(message)
+            except UNREADABLE as error:
+                why = f"{self._msgtype}, {type(error).__name__}: {error}"
+        values, extra = self._nothing
+        return np.int64(0), values, -1 - self._unread.setdefault(why, len(self._unread)), None, 0, extra
+
+    def _read(self, message: Any) -> Row:
+        """Return the row of a message. Raises `UNREADABLE`."""
+        kind = self._kind
+        if kind is None or self._velocity is None:
+            frame_id, matrix, broken = message.header.frame_id, None, 0
+            (values,), (extra,) = _imu(message)
+        else:
+            message = message if kind.adapted is None else kind.adapted(message)
+            frame_id = kind.frame_id(message)
+            broken = kind.broken_rule(message, self._parameters)
+            vector, matrix = self._velocity(message)
+            values, (extra,) = np.array(vector, dtype=float), extra_values(message, self._msgtype)
+        # a stamp beyond 64 bits cannot be read
+        row = np.int64(stamp_ns(message.header.stamp)), values, self._frame(frame_id), matrix, broken, extra
+        self._note_first(message.header.frame_id, None if kind else message.orientation_covariance)
+        return row
 
     def columns(self) -> TopicColumns:
-        """Return all collected messages, each part in order of arrival."""
-        decoded = DecodedRows(
-            **{name: column.array() for name, column in self._laid.items()},
+        """Return all collected messages, in order of arrival."""
+        columns = TopicColumns(
+            self._topic,
+            self._msgtype,
+            **{name: column.array() for name, column in self._columns.items()},
             world=self._world,
             heading_variance=self._heading_variance,
-            frames=tuple(frame_name(name.decode("ascii")) for name in self._frames),
+            frames=tuple(self._frames),
+            unread=tuple(self._unread),
             distinct=np.concatenate([np.zeros((0, 3, 3)), *self._distinct]),
         )
-        if (decoded.arrival[1:] < decoded.arrival[:-1]).any():  # several layouts alternated
-            decoded = decoded.part(np.argsort(decoded.arrival, kind="stable"))
-        arrival, log_ns, channel, end, content = (column.array() for column in self._singles.values())
-        singles = Singles(arrival, log_ns, channel, end, content, tuple(self._channels), self._decoder)
-        if (singles.arrival[1:] < singles.arrival[:-1]).any():
-            singles = singles.part(np.argsort(singles.arrival, kind="stable"))
-        return TopicColumns(self._topic, self._msgtype, decoded, singles)
+        if (columns.arrival[1:] < columns.arrival[:-1]).any():  # several layouts alternated
+            columns = columns.part(np.argsort(columns.arrival, kind="stable"))
+        return columns
 
 
 def _columns_of(vector: Any) -> Array:
@@ -344,36 +304,41 @@ def _columns_of(vector: Any) -> Array:
 
 def extra_width(msgtype: str) -> int:
     """Return the number of additional values per velocity or IMU message."""
-    return 10 if msgtype == ODOMETRY else 3
+    return 10 if msgtype == ODOMETRY else 4 if msgtype in POSE_TYPES else 3
 
 
 def extra_values(message: Any, msgtype: str) -> Array:
-    """Return the angular velocity of a twist (rad/s), or the pose of an odometry.
+    """Return the angular velocity of a twist (rad/s), the pose of an odometry, or the orientation of a pose.
 
     Returns
     -------
     (N, 3) of columns or (1, 3) of a message; of an odometry (N, 10) with its position (m) and its quaternion (x, y, z,
-    w). nan if a type has none.
+    w); of a pose (N, 4) its quaternion. nan if a type has none.
     """
+    if msgtype in POSE_TYPES:
+        return _quaternions(pose_of(message).orientation)
     twist = getattr(message, "twist", None)
     if twist is None:
         return np.full((1, extra_width(msgtype)), np.nan)
     rates = _columns_of(getattr(twist, "twist", twist).angular)
     if msgtype != ODOMETRY:
         return rates
-    q = message.pose.pose.orientation
-    quaternion = np.column_stack([q.x, q.y, q.z, q.w]).astype(float, copy=False)
-    return np.hstack([rates, _columns_of(message.pose.pose.position), quaternion])
+    pose = message.pose.pose
+    return np.hstack([rates, _columns_of(pose.position), _quaternions(pose.orientation)])
 
 
-def _imu(columns: MessageColumns) -> tuple[Array, Array]:
+def _quaternions(q: Any) -> Array:
+    """Stack x, y, z, w as (N, 4)."""
+    return np.column_stack([q.x, q.y, q.z, q.w]).astype(float, copy=False)
+
+
+def _imu(message: Any) -> tuple[Array, Array]:
     """Return quaternion and angular velocity (N, 7), and acceleration (N, 3); nan if missing."""
-    q, w, a = columns.orientation, columns.angular_velocity, columns.linear_acceleration
-    values = np.column_stack([q.x, q.y, q.z, q.w, w.x, w.y, w.z]).astype(float, copy=False)
-    values[columns.orientation_covariance[:, 0] == NO_DATA, :4] = np.nan
-    values[columns.angular_velocity_covariance[:, 0] == NO_DATA, 4:] = np.nan
-    acceleration = _columns_of(a)
-    acceleration[columns.linear_acceleration_covariance[:, 0] == NO_DATA] = np.nan
+    values = np.hstack([_quaternions(message.orientation), _columns_of(message.angular_velocity)])
+    values[message.orientation_covariance[..., 0] == NO_DATA, :4] = np.nan
+    values[message.angular_velocity_covariance[..., 0] == NO_DATA, 4:] = np.nan
+    acceleration = _columns_of(message.linear_acceleration)
+    acceleration[message.linear_acceleration_covariance[..., 0] == NO_DATA] = np.nan
     return values, acceleration
 
 
@@ -391,17 +356,11 @@ def _covariances(kind: VelocityType, columns: MessageColumns) -> Covariances:
 
 
 def _broken(kind: VelocityType, columns: MessageColumns, parameters: Parameters) -> Codes:
-    """Return (N,) the number of the first rule that each DVL message breaks, 0 for none."""
+    """Return (N,) the number of the first rule that each message breaks, 0 for none."""
     broken = np.zeros(len(columns), dtype=np.uint8)
-    if kind.is_dvl:
-        for code, rule in enumerate(kind.rules, start=1):
-            broken[np.asarray(rule.broken(columns, parameters)) & (broken == 0)] = code
+    for code, rule in enumerate(kind.rules, start=1):
+        broken[np.asarray(rule.broken(columns, parameters)) & (broken == 0)] = code
     return broken
-
-
-def stamped(message: Any, log_ns: int) -> int:
-    """Return the stamp of a message (ns), or the log time if missing."""
-    return stamp_ns(message.header.stamp) or log_ns
 
 
 # a larger column (bytes) is kept on disk; only extraordinary recordings have one

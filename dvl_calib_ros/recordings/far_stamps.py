@@ -118,13 +118,13 @@ def without_far(
     findings: Descriptions of the removed messages.
     """
     names = [name for name, part in columns.items() if len(part)]
-    log_ns = [columns[name].arrivals[1] for name in names]
+    log_ns = [columns[name].log_ns for name in names]
     joined = np.concatenate([np.zeros(0, dtype=np.int64), *log_ns])
     [is_log_far] = far([joined])
     log_masks = np.split(is_log_far, np.cumsum([len(stamps) for stamps in log_ns])[:-1]) if names else []
     # a topic that is far as a whole has another clock, which is detected and reported later
     log_masks = [np.zeros_like(mask) if len(mask) >= FEWEST_OF_A_CLOCK and mask.all() else mask for mask in log_masks]
-    stamps_ns = [columns[name].stamps_ns for name in names]
+    stamps_ns = [columns[name].stamped_ns for name in names]
     log_masks = [mask | wrong for mask, wrong in zip(log_masks, logged_elsewhere(stamps_ns, log_ns), strict=True)]
     is_log_far = np.concatenate([is_log_far[:0], *log_masks])
     # messages with wrong log times may have stamps of the same clock: they do not count

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -38,7 +38,7 @@ from ..messages.drivers import (
 from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, recognised, suggested
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from ..verdict.reasons import Reason, finding
-from .columns import Collector, DecodedRows, TopicColumns, is_kept
+from .columns import Collector, TopicColumns, is_kept
 from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, Survey, preview_of, recorded
@@ -154,15 +154,14 @@ class Recording:
         """Return the previews of readable topics; of the others the reason why their first message cannot be read."""
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
         previews = {
-            topic: preview_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic],
-                              start_ns, spans_ns, whole=whole)
-            for topic, parts in columns.items()
+            topic: preview_of(self._of_type(topic), self.counts[topic], start_ns, spans_ns, whole=whole)
+            for topic in columns
         }  # fmt: skip
         read = {topic: preview for topic, preview in previews.items() if preview is not None}
         unread = {
             topic: reason
             for topic, parts in columns.items() if topic not in read
-            for *_, reason in islice((row for part in parts for row in part.singles.messages(slice(1))), 1) if reason
+            for reason in islice((reason for part in parts for reason in part.unread_reasons), 1)
         }  # fmt: skip
         return Survey(self.types, self.counts, read, self.transforms, self.descriptions, unread, self.field_maps)
 
@@ -172,7 +171,11 @@ class Recording:
 
     def recorded(self, topic: str, parameters: Parameters) -> Recorded:
         """Return all messages of a kept topic, unchanged."""
-        return recorded(self.columns[topic], parameters)
+        return recorded(self._of_type(topic), parameters)
+
+    def _of_type(self, topic: str) -> list[TopicColumns]:
+        """Return the parts of a topic that have its type."""
+        return [part for part in self.columns[topic] if part.msgtype == self.types[topic]]
 
     def stretches(self, topics: Mapping[str, Stream], decoder: MessageDecoder, share: float = 1.0) -> Iterator[Stretch]:
         """Yield all messages of some topics as samples, stretch by stretch, in order of arrival.
@@ -286,8 +289,11 @@ def _renumbered(recordings: Sequence[Recording], names: Collection[str]) -> dict
     """Renumber the arrivals in all recordings by log time, and by recording at equal times."""
     arrivals, logs = [], []
     for recording in recordings:
-        by_topic = [part.arrivals for parts in recording.columns.values() for part in parts] or [_NOTHING]
-        arrival, log_ns = (np.concatenate(column) for column in zip(*by_topic, strict=True))
+        kept = [part for parts in recording.columns.values() for part in parts]
+        arrival, log_ns = (
+            np.concatenate([np.zeros(0, dtype=np.int64), *column])
+            for column in ((part.arrival for part in kept), (part.log_ns for part in kept))
+        )
         order = np.argsort(arrival, kind="stable")
         arrivals.append(arrival[order])
         logs.append(log_ns[order])
@@ -300,16 +306,11 @@ def _renumbered(recordings: Sequence[Recording], names: Collection[str]) -> dict
     for recording, arrival in zip(recordings, arrivals, strict=True):
         new_arrivals = new_arrival[begin : begin + len(arrival)]
         begin += len(arrival)
-
-        def renumbered(old_arrivals: Stamps, arrival: Stamps = arrival, new_arrivals: Stamps = new_arrivals) -> Stamps:
-            return np.asarray(new_arrivals[np.searchsorted(arrival, old_arrivals)])
-
         for name, parts in recording.columns.items():
-            columns[name] += [part.arriving(renumbered) for part in parts]
+            columns[name] += [
+                replace(part, arrival=new_arrivals[np.searchsorted(arrival, part.arrival)]) for part in parts
+            ]
     return {name: tuple(parts) for name, parts in columns.items()}
-
-
-_NOTHING = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
 
 def _read(
@@ -324,7 +325,7 @@ def _read(
         on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
     columns = {topic: collector.columns() for topic, collector in contents.sensors.items()}
     for topic in _restamped(columns, parameters.restamp, path):
-        columns[topic] = columns[topic].restamped()
+        columns[topic] = replace(columns[topic], stamps_ns=columns[topic].log_ns)
     kept, file_spans_ns, far_findings = without_far(columns, bag.file_spans_ns)
     types, counts = dict(bag.topics), bag.message_counts
     counts.subtract({topic: len(columns[topic]) - len(column) for topic, column in kept.items()})
@@ -360,8 +361,7 @@ class _Contents:
             named = topics.found_in(self._types)
             sensor_topics, static_topics = sensor_topics & {named.dvl, named.gnss, named.imu}, set()
         self.sensors = {
-            topic: Collector(topic, self._types[topic], counts[topic], parameters, bag.decoder)
-            for topic in sorted(sensor_topics)
+            topic: Collector(topic, self._types[topic], counts[topic], parameters) for topic in sorted(sensor_topics)
         }
         self.waters = {t: WaterCollector(t, kind) for t, kind in self._types.items() if readers(t, kind)}
         self._still_to_read = dict.fromkeys(static_topics, MOST_STATIC)
@@ -465,8 +465,8 @@ LEAST_CHANGE = 1e-4
 def _poses_as_imus(columns: Collection[TopicColumns]) -> list[TopicColumns]:
     """Return the orientations of all topics of poses as IMUs; none if a recorded IMU may have an orientation."""
     imus = [column for column in columns if column.msgtype == IMU_TYPE]
-    # messages without columns (singles) are not looked into
-    if any(len(column.singles) or hold_orientations(column.decoded.values) for column in imus):
+    # messages that cannot be read may have an orientation
+    if any(column.unread or hold_orientations(column.values) for column in imus):
         return []
     return [imu for imu in map(orientations_of, columns) if imu is not None]
 
@@ -475,24 +475,17 @@ def orientations_of(poses: TopicColumns) -> TopicColumns | None:
     """Return the orientations of a topic of poses as an IMU's; None for another type or without orientations."""
     if poses.msgtype not in POSE_TYPES or len(poses) < 3:
         return None
-    values = np.full((len(poses), 7), np.nan)
-    for row, (_, _, message, _) in enumerate(poses.singles.messages()):
-        if message is not None:
-            q = getattr(message.pose, "pose", message.pose).orientation
-            values[row, :4] = q.x, q.y, q.z, q.w
+    values = np.hstack([poses.extra, np.full((len(poses), 3), np.nan)])
     values[~_are_unit(values)] = np.nan
     if not hold_orientations(values):
         return None
     known = np.flatnonzero(np.isfinite(values[:, 0]))
-    (arrival, log_ns), stamps_ns = poses.arrivals, poses.stamps_ns
-    values[known, 4:] = _turn_rates(stamps_ns[known], values[known, :4])
-    n = len(poses)
-    decoded = DecodedRows(
-        arrival, log_ns, stamps_ns, values, np.zeros(n, dtype=np.int32), np.full(n, -1, dtype=np.int32),
-        np.zeros(n, dtype=np.uint8), np.full((n, 3), np.nan), frames=("",),
+    values[known, 4:] = _turn_rates(poses.stamped_ns[known], values[known, :4])
+    return replace(
+        poses, topic=poses.topic + ORIENTATION, msgtype=IMU_TYPE, stamps_ns=poses.stamped_ns, values=values,
+        frame=np.zeros_like(poses.frame), covariance=np.full_like(poses.covariance, -1),
+        broken=np.zeros_like(poses.broken), extra=np.full((len(poses), 3), np.nan), frames=("",), unread=(), world="",
     )  # fmt: skip
-    no_singles = poses.singles.part(np.zeros(0, dtype=np.intp))
-    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, decoded, no_singles)
 
 
 def hold_orientations(values: Array) -> bool:

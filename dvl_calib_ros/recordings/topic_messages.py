@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,10 +20,9 @@ from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import median
 from ..calibration.numerics.samples import Codes, Index, Stamps
 from ..calibration.streams.screening import NOT_MEASURED_VARIANCE, screen_columns
-from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.positions import SELDOM_S, FixDifference, PositionType
-from .columns import ODOMETRY, DecodedRows, TopicColumns, extra_values, stamped
+from ..messages.positions import SELDOM_S, FixDifference
+from .columns import ODOMETRY, TopicColumns, differenced, joined
 
 # Number, length and shortest sampling interval of the bursts. 24 bursts of 6 s contain turns and straights, and reveal
 # clock offsets of seconds; a DVL has at most 10 Hz.
@@ -119,32 +115,58 @@ def preview_of(
     whole: all messages, up to MOST, instead of bursts.
     """
     topic, msgtype = parts[0].topic, parts[0].msgtype
+    position = VELOCITY_TYPES[msgtype].position if msgtype in VELOCITY_TYPES else None
     seconds = 1e-9 * sum(end - start for start, end in spans_ns)
     every_s = seconds / count if count else 0.0
-    is_seldom = every_s > SELDOM_S and is_position(msgtype)
-    rows = _PreviewRows(msgtype, every_s if is_seldom else 1.0)
+    is_seldom = every_s > SELDOM_S and position is not None
     chosen = np.zeros(0, dtype=np.int64) if whole or is_seldom else in_bursts(parts, spans_ns)
     if not len(chosen):  # bursts may miss all messages if one wrong log time makes the recording long
-        chosen = np.sort(np.concatenate([part.arrivals[0] for part in parts]))
-        if not is_position(msgtype):  # positions are kept, because velocities are differences of successive ones
+        chosen = np.sort(np.concatenate([part.arrival for part in parts]))
+        if position is None:  # positions are kept, because velocities are differences of successive ones
             chosen = chosen[:: -(-len(chosen) // MOST) or 1]
-    rows.add_chosen(parts, chosen)
-    ordered = rows.in_order()
-    if ordered is None:
+    rows = joined([part.part(_places(part.arrival, chosen)) for part in parts]).readable
+    if position is not None:
+        rows = differenced(rows, FixDifference(every_s if is_seldom else 1.0, position.between))
+        rows = rows.part(rows.broken == 0)
+    if not len(rows):
         return None
-    stamps_ns, log_ns, values, extra, kept = ordered
+    log_ns, stamps_ns, values, extra = rows.log_ns, rows.stamped_ns, rows.values, rows.extra
+    is_plausible = np.ones(len(rows), dtype=bool)
+    if msgtype != IMU_TYPE:
+        values[(values == 0.0).all(axis=1)] = np.nan  # sent by drivers without a measurement
+        is_plausible &= (np.abs(values) < FASTEST).all(axis=1)
+    for numbers in (values, extra[:, :3]):
+        numbers[~(np.abs(numbers) < FASTEST)] = np.nan  # so that squares are finite
+    kept = np.lexsort((rows.arrival, stamps_ns))
+    kept = kept[is_plausible[kept]]
     clock_rate = _clock_rate(stamps_ns, log_ns)
     ahead_s = 1e-9 * float(median(stamps_ns - start_ns - clock_rate * (log_ns - start_ns)))
-    stamps_s = 1e-9 * (stamps_ns[kept] - start_ns)
-    rate_hz = count / (seconds * clock_rate) if seconds else 0.0
     rates, pose = extra[kept, :3], extra[kept, 3:] if msgtype == ODOMETRY else None
     if msgtype == IMU_TYPE:
         values, rates = np.hstack([values, extra]), np.full((0, 3), np.nan)
     return Preview(
-        topic, msgtype, count, rate_hz, rows.frame_id, stamps_s, ahead_s, values[kept],
-        rates=None if np.isnan(rates).all() else rates, world=rows.world, claimed_std=rows.claimed_std,
-        clock_rate=clock_rate, pose=pose,
+        topic, msgtype, count, count / (seconds * clock_rate) if seconds else 0.0, _first_frame(rows),
+        1e-9 * (stamps_ns[kept] - start_ns), ahead_s, values[kept], rates=None if np.isnan(rates).all() else rates,
+        world=rows.world, claimed_std=_claimed_std(rows, position is not None), clock_rate=clock_rate, pose=pose,
     )  # fmt: skip
+
+
+def _first_frame(rows: TopicColumns) -> str:
+    """Return the frame of the first message that has one."""
+    is_named = np.array([bool(frame) for frame in rows.frames], dtype=bool)[rows.frame]
+    return rows.frames[rows.frame[np.argmax(is_named)]] if is_named.any() else ""
+
+
+def _claimed_std(rows: TopicColumns, is_position: bool) -> float:
+    """Return the median claimed noise per axis, m/s, or of an IMU's heading, rad; nan if none is claimed."""
+    if rows.msgtype == IMU_TYPE:
+        claimed = np.array([rows.heading_variance])
+    else:  # positions without height have a huge vertical variance
+        claimed = np.median(rows.diagonals, axis=1) if is_position else rows.variances.mean(axis=1)
+    claimed = claimed[np.isfinite(claimed) & (claimed > 0.0)]
+    measured = claimed[claimed < NOT_MEASURED_VARIANCE]
+    claimed = measured if len(measured) else claimed
+    return math.sqrt(float(median(claimed))) if len(claimed) else math.nan
 
 
 def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
@@ -172,8 +194,8 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
 
     spans_ns: start and end of each recorded stretch, in order.
     """
-    arrivals = [part.arrivals for part in parts]
-    arrival, log_ns = (np.concatenate(column) for column in zip(*arrivals, strict=True))
+    arrival = np.concatenate([part.arrival for part in parts])
+    log_ns = np.concatenate([part.log_ns for part in parts])
     if len(parts) > 1:
         order = np.argsort(arrival, kind="stable")
         arrival, log_ns = arrival[order], log_ns[order]
@@ -193,140 +215,6 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
             next_ns = now_ns + period_ns - since_ns
         index = max(index + 1, int(log_ns.searchsorted(next_ns)))
     return arrival[chosen]
-
-
-def is_position(msgtype: str) -> bool:
-    """Return whether messages of a type have positions, from which velocities are computed."""
-    kind = VELOCITY_TYPES.get(msgtype)
-    return kind is not None and kind.position is not None
-
-
-class _PreviewRows:
-    """Collector of a preview's rows: arrival, log time (ns), stamp (ns), values and extra values of each message."""
-
-    def __init__(self, msgtype: str, window_s: float) -> None:
-        """Start without rows. window_s: averaging time of velocities from positions."""
-        self._msgtype, self._kind, self._window_s = msgtype, VELOCITY_TYPES.get(msgtype), window_s
-        self._rows: list[tuple[Stamps, Stamps, Stamps, Array, Array]] = []
-        self._names: list[tuple[int, str]] = []
-        self.world = ""
-        self._variances: list[Array] = []
-
-    @property
-    def claimed_std(self) -> float:
-        """Median claimed noise per axis, m/s, of valid messages if any; nan if none is claimed."""
-        variances = np.concatenate([*self._variances, np.zeros(0)])
-        claimed = variances[np.isfinite(variances) & (variances > 0.0)]
-        measured = claimed[claimed < NOT_MEASURED_VARIANCE]
-        claimed = measured if len(measured) else claimed
-        return math.sqrt(float(median(claimed))) if len(claimed) else math.nan
-
-    @property
-    def frame_id(self) -> str:
-        """Frame of the first message that has one."""
-        return min(self._names)[1] if self._names else ""
-
-    def add_chosen(self, parts: Sequence[TopicColumns], chosen: Stamps) -> None:
-        """Add the messages whose arrivals are chosen."""
-        for part in parts:
-            self._add_decoded(part, _places(part.decoded.arrival, chosen))
-        singles = [row for part in parts for row in part.singles.messages(_places(part.singles.arrival, chosen))]
-        singles.sort(key=lambda row: row[0])
-        self._add_messages(
-            [(arrival, log_ns, message) for arrival, log_ns, message, _ in singles if message is not None]
-        )
-
-    def _add_decoded(self, part: TopicColumns, at: Index) -> None:
-        """Add the decoded messages at some indices."""
-        if not len(at):
-            return
-        decoded = part.decoded.part(at)
-        stamps_ns = np.where(decoded.stamps_ns == 0, decoded.log_ns, decoded.stamps_ns)
-        self._rows.append((decoded.arrival, decoded.log_ns, stamps_ns, decoded.values, decoded.extra))
-        self.world = self.world or decoded.world
-        is_velocity = self._kind is not None
-        self._variances.append(decoded.variances.mean(axis=1) if is_velocity else np.array([decoded.heading_variance]))
-        # the first message with a frame suffices
-        is_named = np.array([bool(frame) for frame in decoded.frames], dtype=bool)
-        for row in np.flatnonzero(is_named[decoded.frame])[:1].tolist():
-            self._names.append((int(decoded.arrival[row]), decoded.frames[decoded.frame[row]]))
-
-    def _add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
-        """Decode and add messages, each with its arrival and log time (ns)."""
-        if self._kind is not None and self._kind.position is not None:
-            messages = _velocity_messages(messages, self._kind.position, self._window_s)
-        for arrival, log_ns, message in messages:
-            with suppress(*UNREADABLE):
-                values, extra = self._values_of(message)
-                row = np.array([[arrival], [log_ns], [stamped(message, log_ns)]])
-                name = frame_name(str(message.header.frame_id if self._kind is None else self._kind.frame_id(message)))
-                self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), extra))
-                self._names += [(arrival, name)] if name else []
-                self._variances.append(np.array([self._claimed_variance(message)]))
-                self.world = self.world or frame_name(str(message.header.frame_id))
-
-    def _values_of(self, message: Any) -> tuple[list[float], Array]:
-        """Return a velocity, or an IMU's quaternion and angular velocity; and the additional values."""
-        if self._kind is not None:
-            v = message.velocity if self._kind.position else self._kind.velocity(message)
-            return [v.x, v.y, v.z], extra_values(message, self._msgtype)
-        q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
-        given = (
-            ((q.x, q.y, q.z, q.w), message.orientation_covariance),
-            ((w.x, w.y, w.z), message.angular_velocity_covariance),
-            ((a.x, a.y, a.z), message.linear_acceleration_covariance),
-        )
-        numbers = [np.nan if covariance[0] == NO_DATA else value for values, covariance in given for value in values]
-        return numbers[:7], np.array([numbers[7:]], dtype=float)
-
-    def _claimed_variance(self, message: Any) -> float:
-        """Return the variance that a message reports, averaged over axes; nan if missing."""
-        if self._kind is None:
-            return heading_variance(message.orientation_covariance)
-        given = message.covariance if self._kind.position else self._kind.covariance(message)
-        if given is None or self._kind.lacks_covariance(message):
-            return math.nan
-        flat = np.asarray(given, dtype=float).ravel()
-        variance = flat[[0, 4, 8] if len(flat) == 9 else [0, 7, 14]]
-        # positions without height have a huge vertical variance
-        return float(median(variance) if self._kind.position else variance.mean())
-
-    def in_order(self) -> tuple[Stamps, Stamps, Array, Array, Index] | None:
-        """Return stamps, log times, values, additional values, and the indices of valid rows in order of stamps."""
-        if not self._rows:
-            return None
-        arrival, log_ns, stamps_ns, values, extra = (np.concatenate(column) for column in zip(*self._rows, strict=True))
-        whole = np.ones(len(values), dtype=bool)
-        if self._msgtype != IMU_TYPE:
-            values[(values == 0.0).all(axis=1)] = np.nan  # sent by drivers without a measurement
-            whole = (np.abs(values) < FASTEST).all(axis=1)
-        for numbers in (values, extra[:, :3]):
-            numbers[~(np.abs(numbers) < FASTEST)] = np.nan  # so that squares are finite
-        order = np.lexsort((arrival, stamps_ns))
-        return stamps_ns, log_ns, values, extra, order[whole[order]]
-
-
-def _velocity_messages(
-    messages: Iterable[tuple[int, int, Any]], kind: PositionType, window_s: float
-) -> list[tuple[int, int, Any]]:
-    """Convert positions to velocities between them, at the middle of each window."""
-    difference = FixDifference(window_s, kind.between)
-    found = []
-    for arrival, log_ns, message in messages:
-        if not kind.is_valid(message):
-            continue
-        at_ns = stamped(message, log_ns)
-        fixed = difference(at_ns, *kind.place(message), kind.covariance(message))
-        if fixed is not None:
-            velocity = SimpleNamespace(**dict(zip("xyz", fixed.velocity, strict=True)))
-            seconds, nanoseconds = divmod(fixed.stamp_ns, 1_000_000_000)
-            header = SimpleNamespace(
-                stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=message.header.frame_id
-            )
-            found.append(
-                (arrival, log_ns, SimpleNamespace(velocity=velocity, header=header, covariance=fixed.covariance))
-            )
-    return found
 
 
 # All messages of a topic, unfiltered and in their own axes.
@@ -366,63 +254,27 @@ class Recorded:
         return len(self.stamps_ns)
 
 
-class _Row(NamedTuple):
-    arrival: int
-    log_ns: int
-    stamp_ns: int
-    values: tuple[float, ...]
-    variances: Any
-
-
 def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     """Return all messages of a topic, of which each recording has a part."""
-    topic, msgtype = parts[0].topic, parts[0].msgtype
-    refused: Counter[str] = Counter()
-    unread: list[str] = []
-    rules = VELOCITY_TYPES[msgtype].rules if msgtype in VELOCITY_TYPES else ()
-    for part in parts:
-        counts = np.bincount(part.decoded.broken, minlength=1 + len(rules))[1:].tolist()  # 0: no rule is broken
-        refused.update({rule.counter: count for rule, count in zip(rules, counts, strict=True) if count})
-    single_rows = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
-    rows: list[_Row] = []
-    position = VELOCITY_TYPES[msgtype].position if msgtype in VELOCITY_TYPES else None
-    window_s = 0.0 if position is None else _window_s(single_rows, parameters)
-    if position is not None:
-        rows = _differences(single_rows, position, window_s)
-        unread = [why for _, _, message, why in single_rows if message is None]
-    else:
-        for arrival, log_ns, message, why in single_rows:
-            try:
-                row, broken = _row(arrival, log_ns, message, msgtype, parameters)
-            except UNREADABLE as error:
-                unread.append(why or f"{msgtype}, {type(error).__name__}: {error}")
-                continue
-            rows.append(row)
-            refused.update(broken)
-    is_imu = msgtype == IMU_TYPE
-    width = 4 if is_imu else 3
-    columns = [_of_decoded(part.decoded, width, is_imu) for part in parts]
-    if rows or len(columns) > 1:
-        columns.append(_of_rows(rows, width, is_imu))
-    _, log_ns, stamps_ns, values, variances, unmeasured = columns[0] if len(columns) == 1 else _in_order(columns)
-    values, variances = _plausible(values, FASTEST), _plausible(variances, FASTEST**2)
-    first_reason = unread[0] if unread else ""
+    rows = joined(parts)
+    unread, rows = rows.unread_reasons, rows.readable
+    kind = VELOCITY_TYPES.get(rows.msgtype)
+    rules = () if kind is None else kind.rules
+    counts = np.bincount(rows.broken, minlength=1 + len(rules))[1:].tolist()  # 0: no rule is broken
+    refused = {rule.counter: count for rule, count in zip(rules, counts, strict=True) if count}
+    window_s = 0.0
+    if kind is not None and kind.position is not None:
+        window_s = _window_s(rows.log_ns, parameters)
+        velocities = differenced(rows, FixDifference(window_s, kind.position.between))
+        # log time of the middle of the window, as for a measurement at that time
+        rows = replace(velocities, log_ns=rows.log_ns - (rows.stamped_ns - velocities.stamps_ns))
+        rows = rows.part(rows.broken == 0)
+    claimed = NOTHING if kind is None else (rows.variances, screen_columns(rows.covariances).unmeasured)
+    variances, unmeasured = claimed
     return Recorded(
-        topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, len(unread), window_s, first_reason
-    )
-
-
-def _of_decoded(rows: DecodedRows, width: int, is_imu: bool) -> tuple[Any, ...]:
-    """Return the columns of decoded messages, as `_of_rows`."""
-    claimed = NOTHING if is_imu else (rows.variances, screen_columns(rows.covariances).unmeasured)
-    return rows.arrival, rows.log_ns, rows.stamps_ns, rows.values[:, :width], *claimed
-
-
-def _in_order(columns: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
-    """Join rows and sort them by arrival, the first column."""
-    joined = [np.concatenate(column_parts) for column_parts in zip(*columns, strict=True)]
-    order = np.argsort(joined[0], kind="stable")
-    return tuple(column[order] if len(column) == len(order) else column for column in joined)
+        rows.topic, rows.msgtype, rows.stamps_ns, rows.log_ns, _plausible(rows.values[:, :4], FASTEST),
+        _plausible(variances, FASTEST**2), unmeasured, refused, len(unread), window_s, unread[0] if unread else "",
+    )  # fmt: skip
 
 
 def _plausible(values: Array, most: float) -> Array:
@@ -432,60 +284,7 @@ def _plausible(values: Array, most: float) -> Array:
     return np.where(np.abs(values) < most, values, np.nan)
 
 
-def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Parameters) -> tuple[_Row, list[str]]:
-    """Convert a message. Return its row, and the name of the validity rule that refuses it, if any.
-
-    Raises `UNREADABLE`.
-    """
-    stamp = stamp_ns(message.header.stamp)
-    if msgtype == IMU_TYPE:
-        orientation = message.orientation
-        given = message.orientation_covariance[0] != NO_DATA
-        values = (orientation.x, orientation.y, orientation.z, orientation.w) if given else (np.nan,) * 4
-        return _Row(arrival, log_ns, stamp, values, np.full(3, np.nan)), []
-    kind = VELOCITY_TYPES[msgtype]
-    v = kind.velocity(message)
-    variances = np.full(3, np.nan)
-    covariance = kind.covariance(message)
-    if covariance is not None and not kind.lacks_covariance(message):
-        flat = np.asarray(covariance, dtype=float).reshape(-1)
-        diagonal = flat[[0, 4, 8] if len(flat) == 9 else [0, 7, 14]]
-        if not (diagonal <= 0.0).any():
-            variances = diagonal
-    broken = kind.broken_rule(message, parameters)
-    return _Row(arrival, log_ns, stamp, (v.x, v.y, v.z), variances), [] if broken is None else [broken.counter]
-
-
-def _window_s(singly: Sequence[tuple[int, int, Any, str]], parameters: Parameters) -> float:
+def _window_s(log_ns: Stamps, parameters: Parameters) -> float:
     """Return the time over which positions are differenced."""
-    log_ns = np.array([log_ns for _, log_ns, message, _ in singly if message is not None], dtype=np.int64)
     every_s = 1e-9 * float(np.median(np.diff(log_ns))) if len(log_ns) > 1 else 0.0
     return every_s if every_s > SELDOM_S else parameters.position_window
-
-
-def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType, window_s: float) -> list[_Row]:
-    """Convert positions to velocities between them."""
-    difference = FixDifference(window_s, kind.between)
-    rows = []
-    for arrival, at_log_ns, message, _ in singly:
-        if message is None or not kind.is_valid(message):
-            continue
-        at_ns = stamped(message, at_log_ns)
-        found = difference(at_ns, *kind.place(message), kind.covariance(message))
-        if found is not None:
-            claimed = None if found.covariance is None else np.diag(found.covariance)
-            variances = np.full(3, np.nan) if claimed is None or not (claimed > 0.0).all() else claimed
-            # log time of the middle of the window, as for a measurement at that time
-            rows.append(_Row(arrival, at_log_ns - (at_ns - found.stamp_ns), found.stamp_ns, found.velocity, variances))
-    return rows
-
-
-def _of_rows(rows: Sequence[_Row], width: int, is_imu: bool) -> tuple[Any, ...]:
-    """Return columns: arrival, log time and stamp (N,) ns, values (N, width), variances (N, 3), unmeasured (N,)."""
-    times = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
-    values = np.array([row.values for row in rows], dtype=float).reshape(-1, width)
-    if is_imu:
-        return (*times, values, *NOTHING)
-    variances = np.array([row.variances for row in rows]).reshape(-1, 3)
-    unmeasured = (variances >= NOT_MEASURED_VARIANCE) @ np.array([1, 2, 4])
-    return (*times, values, variances, unmeasured.astype(np.uint8))

@@ -72,7 +72,7 @@ def stream_facts(recording: Recording, parameters: Parameters, topics: Topics) -
     chosen = topics.found_in(recording.types)
     streams = recording.streams(chosen, MessageDecoder(recording.of_types(chosen, parameters)))
     (columns,) = recording.columns[chosen.dvl]
-    return facts_of(streams.dvl, streams.reference, columns.arrivals[1])
+    return facts_of(streams.dvl, streams.reference, columns.log_ns)
 
 
 def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> StreamFacts:

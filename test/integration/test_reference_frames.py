@@ -19,6 +19,7 @@ from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal, frame_named
 from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
+from dvl_calib_ros.recordings.recording import open_recording
 
 
 def odometry_down(told: Told, frame: str, child: str, rates: bool) -> None:
@@ -104,6 +105,20 @@ def test_a_px4_odometry_is_a_reference_in_the_frame_of_its_own_fields(tmp_path, 
     replayed = replay([bag], found.parameters, found.topics)
     assert replayed.result.counts["pairing"]["paired"] > 700
     np.testing.assert_allclose(replayed.result.estimates["full"].lever_arm((0.0, 0.0, 0.0)), LEVER_ARM, atol=0.1)
+
+
+def test_a_px4_odometry_whose_stamp_is_beyond_64_bits_is_not_read(tmp_path):
+    told, three = Told(), np.zeros(3, dtype=np.float32)
+    told.make.store.register(get_types_from_msg(PX4_DEFINITION, PX4))
+    for row, (_, stamp) in enumerate(told.every(10.0)):
+        at_us = 2**63 if row == 7 else stamp // 1000
+        message = told.types(
+            PX4, 0, at_us, 1, three, np.zeros(4, dtype=np.float32), 1, three + 1.0, three, three, three, three, 0, 100
+        )
+        told.say(stamp, "/odometry", PX4, message)
+    recording = open_recording([told.write(tmp_path / "bag")])
+    recorded = recording.recorded("/odometry", Parameters())
+    assert recorded.unreadable == 1 and len(recorded) == recording.counts["/odometry"] - 1 > 100
 
 
 def test_a_px4_odometry_says_what_it_does_not_know_and_its_boot_time_is_no_stamp():

@@ -118,6 +118,22 @@ class Covariances:
         changes = np.concatenate([[True], (raw[1:] != raw[:-1]).any(axis=1)])
         return Covariances(values[changes], np.cumsum(changes) - 1)
 
+    @staticmethod
+    def of_matrices(matrices: Sequence[Array | None]) -> Covariances:
+        """Return the covariances of rows with a matrix (3, 3) each, or None."""
+        (given,) = np.nonzero([matrix is not None for matrix in matrices])
+        values = [matrix for matrix in matrices if matrix is not None]
+        known = Covariances.of(np.array(values).reshape(-1, 3, 3), len(given))
+        index = np.full(len(matrices), -1, dtype=np.intp)
+        index[given] = known.index
+        return Covariances(known.distinct, index)
+
+    @property
+    def matrices(self) -> list[Array | None]:
+        """Matrix (3, 3) of each row, or None."""
+        distinct = [*self.distinct, None]  # index -1 is None
+        return [distinct[place] for place in self.index.tolist()]
+
     def part(self, at: slice | Index | Mask) -> Covariances:
         """Return the rows of a slice, of indices or of a mask."""
         return Covariances(self.distinct, self.index[at])
@@ -212,18 +228,17 @@ class SampleBlock:
 
     def samples(self) -> Iterator[Sample | str]:
         """Yield each row as a live sample, or the reason why its message is none."""
-        covariances: list[Array | None] = [*self.covariances.distinct, None]  # index -1 is None
         rows = zip(
-            self.stamps_ns.tolist(), self.values.tolist(), self.covariances.index.tolist(), self.frames.tolist(),
+            self.stamps_ns.tolist(), self.values.tolist(), self.covariances.matrices, self.frames.tolist(),
             self.refused.tolist(), strict=True,
         )  # fmt: skip
         for stamp_ns, values, covariance, frame, refused in rows:
             if refused:
                 yield self.reasons[refused - 1]
             elif self.stream is Stream.DVL:
-                yield DvlSample(stamp_ns, tuple(values), covariances[covariance])
+                yield DvlSample(stamp_ns, tuple(values), covariance)
             elif self.stream is Stream.REFERENCE:
-                yield ReferenceSample(stamp_ns, tuple(values), covariances[covariance], FRAMES[frame])
+                yield ReferenceSample(stamp_ns, tuple(values), covariance, FRAMES[frame])
             else:
                 orientation, rate = tuple(values[:4]), tuple(values[4:])
                 yield ImuSample(

@@ -61,7 +61,7 @@ def test_a_steady_velocity_comes_out_anywhere_on_earth(place, velocity):
 
 def test_its_noise_is_that_of_both_positions_over_the_window():
     difference = FixDifference(2.0)
-    covariance = np.diag([0.01, 0.02, 0.09]).ravel()
+    covariance = np.diag([0.01, 0.02, 0.09])
     assert difference(START, 43.0, 10.0, 0.0, covariance) is None
     fixed = difference(START + 2_000_000_000, 43.0, 10.0, 0.0, covariance)
     np.testing.assert_allclose(np.diag(fixed.covariance), [0.005, 0.01, 0.045])

@@ -110,12 +110,10 @@ def test_stamps_of_messages_that_are_decoded_one_by_one_are_those_of_their_heade
     [part] = next(parts for parts in recording.columns.values() if parts[0].msgtype == kind)
     with BagReader([bag], KNOWN_DEFINITIONS) as reader:
         expected = [stamp_ns(message.header.stamp) or log_ns for _, log_ns, message, _ in reader.messages([part.topic])]
-    assert part.stamps_ns.tolist() == expected
+    assert part.stamped_ns.tolist() == expected
     kept = np.arange(len(part)) % 3 > 0
-    assert part.part(kept).stamps_ns.tolist() == np.array(expected)[kept].tolist()
-    assert [row[:2] for row in part.part(kept).singles.messages()] == [
-        row[:2] for row, is_kept in zip(part.singles.messages(), kept, strict=False) if is_kept
-    ]
+    assert part.part(kept).stamped_ns.tolist() == np.array(expected)[kept].tolist()
+    np.testing.assert_array_equal(part.part(kept).arrival, part.arrival[kept])
 
 
 def logged(path, topic: str, off: dict[int, int], storage: str, pause_ns: int = 0):

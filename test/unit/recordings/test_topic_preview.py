@@ -6,6 +6,7 @@ from bisect import bisect_right
 
 import numpy as np
 from conftest import searched
+from driver_fixtures import ODOMETRY, TWIST, write_driver_bag
 from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import run, write_bag
@@ -24,7 +25,7 @@ class Topic:
     """What `in_bursts` asks of a topic's columns."""
 
     def __init__(self, arrival, log_ns) -> None:
-        self.arrivals = np.array(arrival, dtype=np.int64), np.array(log_ns, dtype=np.int64)
+        self.arrival, self.log_ns = np.array(arrival, dtype=np.int64), np.array(log_ns, dtype=np.int64)
 
 
 def one_by_one(log_ns: list[int], spans_ns: list[tuple[int, int]]) -> list[int]:
@@ -108,3 +109,11 @@ def test_positions_that_the_receiver_marks_invalid_give_no_velocity_of_a_preview
     preview = open_recording([tmp_path / "bag"]).survey.previews["fix"]
     assert len(preview.values) > 100
     np.testing.assert_allclose(preview.values, np.tile([0.0, 1.0, 0.0], (len(preview.values), 1)), atol=0.01)
+
+
+def test_of_recordings_with_different_types_on_a_topic_those_of_the_last_type_are_examined(tmp_path):
+    bags = [write_driver_bag(tmp_path / name, run(10.0), kind) for name, kind in (("a", ODOMETRY), ("b", TWIST))]
+    both, second = open_recording(bags), open_recording(bags[1:])
+    assert both.types["dvl/twist"] == TWIST
+    found, expected = (each.recorded("dvl/twist", Parameters()) for each in (both, second))
+    np.testing.assert_array_equal(found.values, expected.values)
