@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from itertools import product
 
@@ -18,7 +19,8 @@ from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Stream
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
-from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS
+from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS, POSE_TYPES
+from dvl_calib_ros.messages.encode import FIX_TYPE
 from dvl_calib_ros.recordings import columns, far_stamps
 from dvl_calib_ros.recordings import sample_columns as kept_streams
 from dvl_calib_ros.recordings.recording import open_recording
@@ -118,6 +120,53 @@ def test_every_type_gives_the_same_samples_in_columns(tmp_path, kind, reference,
         assert {"water_track", "few_beams", "no_bottom", "flagged_invalid", "unknown_mode"} <= {
             each for _, each in found if isinstance(each, str)
         }
+
+
+@pytest.mark.parametrize("kind", [FIX_TYPE, *POSE_TYPES])
+def test_positions_give_the_same_velocities_and_fixes_in_columns(tmp_path, monkeypatch, kind):
+    """Some are invalid, nan, without stamp, without covariance, in another frame or before a pause."""
+    new = {name.rpartition("/")[2]: made for name, made in JAZZY.types.items()}
+    messages = []
+    for row in range(300):
+        at_ns = 1_700_000_000 * 10**9 + row * 200_000_000 + (10**10 if row > 200 else 0)
+        stamp = new["Time"](*divmod(0 if row % 40 == 3 else at_ns, 10**9))
+        header = new["Header"](stamp, "elsewhere" if row % 50 == 7 else "ned" if row > 250 else "map")
+        x, y, z = 1e-5 * row, 2e-5 * row, math.nan if row % 60 == 5 else 0.1
+        point = new["Point"](1e5 * x, 1e5 * y, z)
+        pose = new["Pose"](point, new["Quaternion"](0.0, 0.0, 0.0, 1.0))
+        variance = 0.0 if row % 9 == 0 else 1e-4 * (1 + row // 100)
+        if kind == FIX_TYPE:
+            status = new["NavSatStatus"](-1 if row % 10 == 0 else 0, 1)
+            covariance = variance * np.eye(3).ravel()
+            message = new["NavSatFix"](header, status, 43.0 + x, 10.0 + y, z, covariance, int(variance > 0.0))
+        elif kind == POSE_TYPES[0]:
+            message = new["PoseWithCovarianceStamped"](
+                header, new["PoseWithCovariance"](pose, variance * np.eye(6).ravel())
+            )
+        else:
+            message = new["PoseStamped"](header, pose)
+        messages.append(("gnss/twist", at_ns, bytes(JAZZY.serialize_cdr(message, kind))))
+    path = tmp_path / "bag.mcap"
+    definition = JAZZY.generate_msgdef(kind, ros_version=2)[0]
+    path.write_bytes(mcap_bytes(messages, {"gnss/twist": (kind, definition)}))
+    fixes: list[list[str]] = []
+    parameters = Parameters(gnss_type=kind)
+    monkeypatch.setattr(MessageDecoder, "forget", noting(fixes, MessageDecoder.forget))
+    found = assert_same([path], parameters)
+    assert len(found) == 300 and sum(not isinstance(sample, str) for _, sample in found) > 150
+    assert fixes[0] == fixes[1] and len(fixes[0]) > 200
+
+
+def noting(fixes, forget):
+    """`MessageDecoder.forget` that also begins a list of the decoder's fixes."""
+
+    def forgets(decoder):
+        forget(decoder)
+        noted: list[str] = []
+        fixes.append(noted)
+        decoder.on_fix = lambda *fix: noted.append(repr(fix))
+
+    return forgets
 
 
 FRAMES = ["dvl_link", "dvl_frd", "base_link", "map", "ned", "odom", "", "x", "gnss", "größe", "a\0b"]
