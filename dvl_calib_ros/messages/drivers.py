@@ -235,7 +235,7 @@ def _lacks_pose_covariance(message: Any) -> Any:
 
 
 _LINEAR, _TWIST_LINEAR, _VELOCITY = map(attrgetter, ("twist.linear", "twist.twist.linear", "velocity"))
-_reference_alone = partial(VelocityType, is_read_in_columns=False, is_reference=True, is_dvl=False)
+_reference_alone = partial(VelocityType, is_reference=True, is_dvl=False)
 
 _MARINE_DVL = """std_msgs/Header header
 uint8 DVL_MODE_BOTTOM=1
@@ -438,6 +438,7 @@ VELOCITY_TYPES: dict[str, VelocityType] = {
             velocity=_course_and_speed,
             covariance=_speed_covariance,
             covariance_says="`err_speed`, `err_climb` (95 %); zero: not given",
+            is_read_in_columns=False,
             frame_says="east-north-up",
             reference_frame=VelocityFrame.ENU,
             install="sudo apt install ros-$ROS_DISTRO-gps-msgs",
@@ -447,6 +448,7 @@ VELOCITY_TYPES: dict[str, VelocityType] = {
             sent_by="PX4 (uXRCE-DDS)",
             covariance=attrgetter("covariance"),
             covariance_says="`velocity_variance`; nan: not given",
+            is_read_in_columns=False,
             frame_says="`velocity_frame`: NED or BODY_FRD",
             adapted=of_vehicle_odometry,
             install="build px4_msgs in your workspace",
