@@ -75,8 +75,9 @@ def _block(stream: Stream, rows: TopicColumns, decoder: MessageDecoder) -> Sampl
     }  # fmt: skip
     readable = rows.readable
     # a frame is judged at its first message: the DVL's first frame is the DVL's own
-    for _, name in sorted(_first_of_frames(readable)):
-        judge[stream](name)
+    places, first = np.unique(readable.frame, return_index=True)
+    for place in places[np.argsort(first)].tolist():
+        judge[stream](readable.frames[place])
     block = (_imu if stream is Stream.IMU else _velocity)(stream, readable, decoder)
     if len(readable) == len(rows):
         return block
@@ -91,48 +92,29 @@ def _block(stream: Stream, rows: TopicColumns, decoder: MessageDecoder) -> Sampl
     return block.part(np.argsort(block.arrival, kind="stable"))
 
 
-def _first_of_frames(rows: TopicColumns) -> list[tuple[int, str]]:
-    """Return the arrival of the first message of each frame, and the frame's name."""
-    if len(rows) and (rows.frame == rows.frame[0]).all():
-        places = [int(rows.frame[0])]
-    else:
-        places = np.flatnonzero(np.bincount(rows.frame)).tolist()
-    return [(int(rows.arrival[np.argmax(rows.frame == place)]), rows.frames[place]) for place in places]
-
-
 def _velocity(stream: Stream, rows: TopicColumns, decoder: MessageDecoder) -> SampleBlock:
     """Return the samples of DVL or reference, after all frames were judged."""
-    refused = np.zeros(len(rows), dtype=np.uint8)
-    reasons: list[str] = []
-    frames = np.zeros(len(rows), dtype=np.uint8)
     values, covariances = rows.values, rows.covariances
-    names = {place: rows.frames[place] for place in np.flatnonzero(np.bincount(rows.frame)).tolist()}
-    is_other = np.zeros(len(rows.frames), dtype=bool)
     counters = [rule.counter for rule in decoder.dvl_type.rules] if stream is Stream.DVL else []
+    places, index = np.unique(rows.frame, return_inverse=True)
+    names = [rows.frames[place] for place in places.tolist()]
     if stream is Stream.DVL:
-        for place, name in names.items():
-            is_other[place] = name != decoder.dvl_frame
+        is_other = np.array([name != decoder.dvl_frame for name in names], dtype=bool)[index]
+        frames = np.zeros(len(rows), dtype=np.uint8)
     else:
-        codes = np.zeros(len(rows.frames), dtype=np.uint8)
-        axes: dict[Axes, Mask] = {}
-        for place, name in names.items():
-            declared = decoder.reference_frame(name)
-            is_other[place] = declared is None
-            codes[place] = 0 if declared is None else FRAME_CODES[declared.frame]
-            if declared is not None and declared.axes is not AS_SENT:
-                axes.setdefault(declared.axes, np.zeros(len(rows.frames), dtype=bool))[place] = True
-        frames = codes[rows.frame]
+        declared = [decoder.reference_frame(name) for name in names]
+        is_other = np.array([each is None for each in declared], dtype=bool)[index]
+        frames = np.array([FRAME_CODES[each.frame] if each else 0 for each in declared], dtype=np.uint8)[index]
         if decoder.reference_type.position is not None:
             counters = [*(rule.counter for rule in decoder.reference_type.rules), FIRST_FIX]
-            rows = _between_positions(rows, is_other[rows.frame], frames, decoder)
-            values, covariances, axes = rows.values, rows.covariances, {}
-        for frame_axes, of_frame in axes.items():
-            values, covariances = _turned(frame_axes, values, covariances, of_frame[rows.frame])
-    broken = [(counter, rows.broken == code) for code, counter in enumerate(counters, start=1)]
-    for reason, is_broken in [(WRONG_FRAME, is_other[rows.frame]), *broken]:
-        new = is_broken & (refused == 0)
-        if new.any():
-            refused[new] = 1 + _index_of_reason(reasons, reason)
+            rows = _between_positions(rows, is_other, frames, decoder)
+            values, covariances, declared = rows.values, rows.covariances, []
+        for axes in {each.axes for each in declared if each} - {AS_SENT}:
+            which = np.array([each is not None and each.axes == axes for each in declared], dtype=bool)[index]
+            values, covariances = _turned(axes, values, covariances, which)
+    reasons = [WRONG_FRAME, *counters]
+    broken = rows.broken + (rows.broken > 0) if counters else np.zeros(len(rows))
+    refused = np.where(is_other, 1, broken).astype(np.uint8)
     if stream is Stream.DVL and not refused.all():
         decoder.note_axes()
         if decoder.turns_dvl:
@@ -183,9 +165,3 @@ def _stamped(stream: Stream, rows: TopicColumns, decoder: MessageDecoder, refuse
     if is_zero.any():
         decoder.note_zero_stamps(stream, int(np.count_nonzero(is_zero)))
     return np.where(is_zero, rows.log_ns, rows.stamps_ns)
-
-
-def _index_of_reason(reasons: list[str], reason: str) -> int:
-    if reason not in reasons:
-        reasons.append(reason)
-    return reasons.index(reason)
