@@ -105,8 +105,11 @@ MOST = 100_000
 _CODES = {stream: code for code, stream in enumerate(Stream)}
 
 
-class DecodedMessages(RowTable):
-    """Samples and refusals of messages that were decoded individually, in order of arrival."""
+class KeptMessages(RowTable):
+    """Samples and refusals of all messages so far, or none after more than `MOST`. is_kept: whether it has them.
+
+    The memory is allocated at the start, so that a node's memory does not grow with the messages received.
+    """
 
     stream: Codes = column(np.uint8)
     stamps_ns: Stamps = column(np.int64)
@@ -118,10 +121,16 @@ class DecodedMessages(RowTable):
 
     def __init__(self) -> None:
         super().__init__()
+        self.reserve(int(FULL * MOST))  # no row is ever dropped, so the whole capacity of MOST rows is used
+        self.is_kept = True
         self._reasons: list[str] = []
 
     def add(self, stream: Stream, decoded: Sample | str) -> None:
-        """Add a message's sample, or the reason for its refusal."""
+        """Keep a message's sample, or the reason for its refusal."""
+        if self.is_kept and self.size == MOST:
+            self.forget()
+        if not self.is_kept:
+            return
         at = self.extend(1).start
         self.stream[at] = _CODES[stream]
         self.stamps_ns[at] = self.frames[at] = self.refused[at] = 0
@@ -156,25 +165,6 @@ class DecodedMessages(RowTable):
             covariance=Covariances(given.distinct, index), frames=self.frames[rows], arrival=rows,
             refused=self.refused[rows], reasons=self._reasons,
         )  # fmt: skip
-
-
-class KeptMessages(DecodedMessages):
-    """All messages so far, or none after more than `MOST`. is_kept: whether it has them.
-
-    The memory is allocated at the start, so that a node's memory does not grow with the messages received.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.reserve(int(FULL * MOST))  # no row is ever dropped, so the whole capacity of MOST rows is used
-        self.is_kept = True
-
-    def add(self, stream: Stream, decoded: Sample | str) -> None:
-        """Keep a message's sample, or the reason for its refusal."""
-        if self.is_kept and self.size == MOST:
-            self.forget()
-        if self.is_kept:
-            super().add(stream, decoded)
 
     def forget(self) -> None:
         """Stop keeping messages."""
