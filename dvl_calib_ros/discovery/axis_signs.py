@@ -67,7 +67,7 @@ def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None
     rates = angular_velocity_at(TurnRates.of(imu), times, GAP_S)
     known = known & np.isfinite(rates).all(axis=1) & np.isfinite(velocity).all(axis=1)
     times, velocity, rate, rotation = times[known], velocity[known], rates[known, 2], rotation[known]
-    heading, up = rotation[:, :2, 0], float(np.sign(rotation[:, 2, 2].mean()))
+    heading = rotation[:, :2, 0]
     heading = heading / np.maximum(np.linalg.norm(heading, axis=1), 1e-9)[:, None]
     after = np.searchsorted(times, times + OVER_S - 1e-6)
     before = np.flatnonzero(after < len(times))
@@ -78,6 +78,7 @@ def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None
     before, after = before[is_turn], after[is_turn]
     if len(before) < FEWEST_TURNS:
         return None
+    up = float(np.sign(rotation[:, 2, 2].mean()))
     port = np.column_stack([-heading[:, 1], heading[:, 0]])
     # nuisance: misalignment, lever arm, skid
     sway_columns = np.column_stack([port, velocity[:, 0], rate, rate * velocity[:, 0]])

@@ -11,6 +11,8 @@ from stacks import LEVER_ARM, TWIST, Told
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.streams.interpolation import ImuColumns
+from dvl_calib_ros.discovery.axis_signs import sway_sign
 from dvl_calib_ros.simulation.trajectories import make_motion
 
 CURRENT_MPS = (0.2, 0.1, 0.0)
@@ -99,3 +101,9 @@ def test_a_mirrored_y_with_the_yaw_of_the_other_sign_is_asked(tmp_path):
     assert "positive when the vehicle moves to port?" in question.sentence
     with_current = recording(tmp_path / "current", signs, mounting=(0.0, 0.0, np.pi / 4.0), said=said)
     assert codes(reasons_of(dc.replay(with_current, history=False)))[0] == "DVL_SIDE_INVERTED"
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_an_attitude_at_any_velocity_nothing_is_said_of_the_sway():
+    later = ImuColumns(np.arange(100, 110) * 1.0, np.tile([0.0, 0.0, 0.0, 1.0], (10, 1)), np.zeros((10, 3)))
+    assert sway_sign(np.arange(10.0), np.ones((10, 3)), later) is None
