@@ -35,10 +35,18 @@ PARENT_LOOKED_FOR_S = 1.0
 
 @dataclass(frozen=True)
 class Workers:
-    """Choice of workers. jobs: local processes, 0: one per core. dask: address of a scheduler, '' for none."""
+    """Choice of workers. jobs: local processes, 0: one per core. dask: address of a scheduler, '' for none.
+
+    Raises InputError for a negative number.
+    """
 
     jobs: int = 1
     dask: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the number of processes."""
+        if self.jobs < 0:
+            raise InputError(f"--jobs: {self.jobs} is negative; give a number of processes, or 0 for one per core")
 
 
 @dataclass(frozen=True)
