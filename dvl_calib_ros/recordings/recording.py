@@ -151,7 +151,7 @@ class Recording:
         return self._surveyed({name: self.columns[name] for name in named if name in self.columns}, whole=True)
 
     def _surveyed(self, columns: Mapping[str, tuple[TopicColumns, ...]], *, whole: bool) -> Survey:
-        """Return the previews of readable topics; of the others the reason why their first message cannot be read."""
+        """Return the previews of readable topics; of topics without a readable message the reason."""
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
         previews = {
             topic: preview_of(self._of_type(topic), self.counts[topic], start_ns, spans_ns, whole=whole)
@@ -159,9 +159,10 @@ class Recording:
         }  # fmt: skip
         read = {topic: preview for topic, preview in previews.items() if preview is not None}
         unread = {
-            topic: reason
-            for topic, parts in columns.items() if topic not in read
-            for reason in islice((reason for part in parts for reason in part.unread_reasons), 1)
+            topic: reasons[0]
+            for topic, parts in columns.items()
+            if (reasons := [reason for part in parts for reason in part.unread_reasons])
+            and len(reasons) == sum(map(len, parts))
         }  # fmt: skip
         return Survey(self.types, self.counts, read, self.transforms, self.descriptions, unread, self.field_maps)
 
