@@ -18,7 +18,7 @@ from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from ..calibration.streams.imu_frame import ImuAlignment
 from ..verdict.reasons import Reason, finding
 from .drivers import IMU_TYPE, NOT_MEASURED, VelocityType, velocity_type
-from .positions import FixDifference, Place, PositionType
+from .positions import SATELLITES, FixDifference, Place, PositionType
 
 # counters of physically impossible messages, and of messages in another frame
 INVALID, WRONG_FRAME = "invalid", "wrong_frame"
@@ -267,7 +267,7 @@ class MessageDecoder:
             broken = 0 if kind.position is None else kind.broken_rule(message, self.parameters)
             if broken:
                 return Refusal(kind.rules[broken - 1].counter)
-            axes = frame.axes if kind.position is None else AS_SENT
+            axes = AS_SENT if kind.position is SATELLITES else frame.axes  # latitude and longitude have no axes
             if axes not in self._reference_readers:
                 self._reference_readers[axes] = VelocityReader(kind, axes)
             values, covariance = self._reference_readers[axes](message)

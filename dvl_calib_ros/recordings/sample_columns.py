@@ -23,6 +23,7 @@ from ..calibration.numerics.samples import (
     sample_block,
 )
 from ..messages.decode import AS_SENT, FIRST_FIX, HALF_TURN, INVALID, WRONG_FRAME, Axes, MessageDecoder
+from ..messages.positions import SATELLITES
 from .columns import TopicColumns, differenced, joined
 
 # messages of a stretch: enough for columns to be efficient, few enough for the caches
@@ -105,13 +106,16 @@ def _velocity(stream: Stream, rows: TopicColumns, decoder: MessageDecoder) -> Sa
         declared = [decoder.reference_frame(name) for name in names]
         is_other = np.array([each is None for each in declared], dtype=bool)[index]
         frames = np.array([FRAME_CODES[each.frame] if each else 0 for each in declared], dtype=np.uint8)[index]
-        if decoder.reference_type.position is not None:
-            counters = [*(rule.counter for rule in decoder.reference_type.rules), FIRST_FIX]
-            rows = _between_positions(rows, is_other, frames, decoder)
-            values, covariances, declared = rows.values, rows.covariances, []
-        for axes in {each.axes for each in declared if each} - {AS_SENT}:
+        position = decoder.reference_type.position
+        for axes in {each.axes for each in declared if each and position is not SATELLITES} - {AS_SENT}:
             which = np.array([each is not None and each.axes == axes for each in declared], dtype=bool)[index]
             values, covariances = _turned(axes, values, covariances, which)
+        if position is not None:
+            counters = [*(rule.counter for rule in decoder.reference_type.rules), FIRST_FIX]
+            indices, distinct = covariances.index.astype(np.int32), covariances.distinct
+            rows = replace(rows, values=values, covariance=indices, distinct=distinct)
+            rows = _between_positions(rows, is_other, frames, decoder)
+            values, covariances = rows.values, rows.covariances
     reasons = [WRONG_FRAME, *counters]
     broken = rows.broken + (rows.broken > 0) if counters else np.zeros(len(rows))
     refused = np.where(is_other, 1, broken).astype(np.uint8)

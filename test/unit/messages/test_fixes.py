@@ -105,6 +105,21 @@ def test_positions_are_a_reference_in_east_north_up_whatever_their_frame_is_call
     assert sample.velocity[1] == pytest.approx(1.111, abs=0.001) and sample.covariance is None
 
 
+@pytest.mark.parametrize(("frame", "north_mps"), [("map", 0.0), ("map_nwu", 1.0)])
+def test_poses_in_a_north_west_up_map_are_turned_to_east_north_up(frame, north_mps):
+    decoder = MessageDecoder(Parameters(gnss_type="geometry_msgs/msg/PoseStamped"))
+    fixes = []
+    decoder.on_fix = lambda *fix: fixes.append(fix)
+    for second in range(2):
+        stamp = SimpleNamespace(sec=START // 10**9 + second, nanosec=0)
+        position = SimpleNamespace(x=1.0 * second, y=0.0, z=0.0)
+        header = SimpleNamespace(stamp=stamp, frame_id=frame)
+        sample = decoder.reference(SimpleNamespace(header=header, pose=SimpleNamespace(position=position)), 0)
+    expected = (1.0 - north_mps, north_mps, 0.0)
+    np.testing.assert_allclose(sample.velocity, expected, atol=1e-12)
+    np.testing.assert_allclose(fixes[1][1], expected, atol=1e-12)
+
+
 def test_course_and_speed_over_ground_are_east_and_north():
     decoder = MessageDecoder(Parameters(gnss_type="gps_msgs/msg/GPSFix"))
     message = fix(START)

@@ -130,7 +130,7 @@ def test_positions_give_the_same_velocities_and_fixes_in_columns(tmp_path, monke
     for row in range(300):
         at_ns = 1_700_000_000 * 10**9 + row * 200_000_000 + (10**10 if row > 200 else 0)
         stamp = new["Time"](*divmod(0 if row % 40 == 3 else at_ns, 10**9))
-        header = new["Header"](stamp, "elsewhere" if row % 50 == 7 else "ned" if row > 250 else "map")
+        header = new["Header"](stamp, "elsewhere" if row % 50 == 7 else "map_nwu" if row > 250 else "map")
         x, y, z = 1e-5 * row, 2e-5 * row, math.nan if row % 60 == 5 else 0.1
         point = new["Point"](1e5 * x, 1e5 * y, z)
         pose = new["Pose"](point, new["Quaternion"](0.0, 0.0, 0.0, 1.0))
