@@ -221,9 +221,7 @@ def nearest_rotation(products: Array) -> Array:
 
 def turn_between(before: Array, after: Array) -> Array:
     """Return axis times angle (3,) rad of the rotation between two mountings (3, 3), about body axes."""
-    *axis, cosine = quaternion_from_rotation(after @ before.T)
-    sine = math.hypot(*axis)
-    return np.array(axis) * (2.0 * math.atan2(sine, cosine) / sine if sine > 1e-12 else 2.0)
+    return rotation_vector(quaternion_from_rotation(after @ before.T))
 
 
 def rotation_of(vector: Array) -> Array:
