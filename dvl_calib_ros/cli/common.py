@@ -169,6 +169,7 @@ def check_outputs(
     """
     from ..disk.atomic import check_folder_writable, check_writable
     from ..files.output_paths import check_outputs as check_apart
+    from ..files.output_paths import check_report_name
 
     given = {name: value for name, value in vars(arguments).items() if isinstance(value, Path)}
     for name in files:
@@ -189,6 +190,7 @@ def check_outputs(
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
     check_apart(as_options[0] | dict(also_written or {}), read, as_options[1])
     if "report" in given:
+        check_report_name(given["report"], *([".png"] if arguments.command == "compare" else []))
         with needing_page("--report"):
             from ..present import page  # noqa: F401
 

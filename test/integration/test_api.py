@@ -133,6 +133,7 @@ def test_values_that_no_data_support_are_marked_where_the_mounting_is_printed(ba
         (lambda run, to: dc.simulate(to, waves=0.3), "Waves(height="),
         (lambda run, to: dc.simulate(to, trajectory="foo"), "box"),
         (lambda run, to: dc.simulate(to, seconds="long"), "expected a number"),
+        (lambda run, to: dc.report(run, to.with_suffix(".pdf")), "a page (HTML)"),
         (lambda run, to: run.correct([1.0, 2.0]), "expected (..., 3)"),
         (lambda run, to: run.correct("abc"), "velocity_dvl"),
         (lambda run, to: run.correct(np.zeros((2, 3)), np.zeros((4, 3))), "(4, 3); velocity_dvl has (2, 3)"),

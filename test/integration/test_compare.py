@@ -88,6 +88,11 @@ def test_json_and_pictures_say_the_same(place, tmp_path, monkeypatch, capsys):
     assert document["says"][0] in text and text.count("<img") >= 2
     assert main(["compare", *results, "--report", str(png)]) == 4
     assert png.read_bytes().startswith(b"\x89PNG")
+    capsys.readouterr()
+    for command, wrong in (("replay", png), ("compare", tmp_path / "c.pdf")):
+        assert main([command, *results, "--report", str(wrong)]) == 2
+        assert "a page (HTML); give a name that ends in .html" in capsys.readouterr().err
+    assert png.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("hours_apart", [0.25, 9, 240, 24 * 500])
