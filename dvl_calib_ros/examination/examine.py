@@ -37,8 +37,6 @@ from . import topic_checks
 
 # a reference below this rate (Hz) interpolates turns by straight lines; 1 Hz receivers are a little slow at times
 SLOW_REFERENCE = 0.8
-# prefix of the findings that are reported first
-NO_IMU = "DOCTOR_NO_IMU"
 # ratios of speeds outside this range mean different units
 UNIT_FACTORS = (0.7, 1.4)
 UNITS = {
@@ -114,7 +112,7 @@ class Examination(Answering):
             return self.against[0].full_sentence
         errors = [reason for reason in self.findings if reason.severity is Severity.ERROR]
         if errors:
-            return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
+            return f"{errors[0].says}."
         if not self.has_reference and self.verdict != "no":
             return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
         if self.cannot or self.verdict == "no":
@@ -234,7 +232,7 @@ def judged_replay(
     look = recording.survey.previews.get(streams["dvl"].topic)
     findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
     errors = [reason for reason in findings if _has_error([reason])]
-    if not errors or errors[0].code.startswith(NO_IMU):  # that there is no IMU is said before the verdict
+    if not errors or errors[0].code == "DOCTOR_NO_IMU_EARTH":  # the replay has its own finding
         return replayed
     judged = judged.with_objections([errors[0].weighed(Severity.REJECT)])
     result = replace(result, verifications={**result.verifications, result.selected: judged})
@@ -330,7 +328,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         found.append(finding("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
     elif reference is not None and not over_legs:
         found += _disagreement(discovery, topic_checks.shown_noise(reference.values) / float(np.median(speed)))
-    return sorted(found, key=lambda each: (not each.code.startswith(NO_IMU), each.severity is not Severity.ERROR))
+    return sorted(found, key=lambda each: each.severity is not Severity.ERROR)
 
 
 def _is_compared_over_legs(reference: Recorded) -> bool:

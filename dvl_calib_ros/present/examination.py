@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..examination.examine import NO_IMU, Content, Examination, Shown
+from ..examination.examine import Content, Examination, Shown
 from ..files.parameter_files import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
@@ -29,12 +29,11 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     severity, answer = ANSWERS[examined.verdict]
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
-    lead, found = (found[0], found[1:]) if found and found[0].code.startswith(NO_IMU) else (None, found)
     found = (*found, *(each for each in examined.against if each.says not in {one.says for one in found}))
     notes = (note.sentence for note in discovery.notes)
     lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
-    otherwise = "else " if lead or examined.notes else ""
+    otherwise = "else " if examined.notes else ""
     nothing = NO_SAMPLE if examined.has_reference else NO_REFERENCE
     return Document(
         title="Examination of a recording",
@@ -53,7 +52,6 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
             ),
             Section("", [Commands(next_commands(examined, is_live, named))]),
         ],
-        lead=lead,
     )
 
 

@@ -171,9 +171,7 @@ def replayed(
     rejected = verification is not None and verification.verdict is Severity.REJECT
     drift = None if rejected else run.navigation
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
-    first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
-    notes = [note for note in run.notes if first is None or note != str(first)]
-    shown_warnings = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
+    shown_warnings = [note for note in run.notes if not note.startswith(others)] if warnings is None else warnings
     where = Where.BOTH if details else Where.PAGE
     streams = [(name, result.counts[key]) for key, name in _STREAMS]
     # an angle that is not observable must not be put on a vehicle
@@ -219,7 +217,6 @@ def replayed(
             ),
         ],
         parameters=result.parameters,
-        lead=first,
         folded=[note for note in run.notes if note.startswith(others)] if warnings is None else (),
     )
 

@@ -337,6 +337,15 @@ def test_the_standard_deviations_are_those_that_the_replay_claims(name, tmp_path
         assert claimed[each.name].shown == (each.needs == ""), each
 
 
+@pytest.mark.parametrize(
+    ("command", "answer", "named_at"), [("doctor", "partly: ", "out"), ("replay", "accept: ", "err")]
+)
+def test_the_answer_comes_before_the_finding_that_there_is_no_imu(capsys, command, answer, named_at):
+    out, err = succeed(capsys, command, ROOT / "bags" / "straight_leg")
+    assert out.startswith(answer) and "Nothing else wrong" not in out
+    assert "no IMU in the bag: " in {"out": out, "err": err}[named_at]
+
+
 def test_a_bag_without_a_dvl_is_refused_in_one_line(tmp_path, capsys):
     run = simulate(scenario(seconds=10.0))
     assert "no topic looks like a DVL's" in fail(capsys, "doctor", write_bag(tmp_path / "bag", run.gnss))
