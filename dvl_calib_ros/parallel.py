@@ -40,6 +40,10 @@ class Workers:
     jobs: int = 1
     dask: str = ""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.jobs, int) or self.jobs < 0:
+            raise InputError(f"jobs: {self.jobs!r} is no number of processes; give 0 for one per core")
+
 
 @dataclass(frozen=True)
 class Lost:

@@ -55,8 +55,6 @@ def run(arguments: argparse.Namespace) -> None:
     sets = common.chosen("--sets", arguments.sets, [each.name for each in SETS])
     if not 1 <= arguments.seeds <= MAX_SEEDS:
         raise InputError(f"--seeds: {arguments.seeds} is outside 1 .. {MAX_SEEDS}")
-    if arguments.jobs < 0:
-        raise InputError(f"--jobs: {arguments.jobs} is negative; give a number of processes, or 0 for one per core")
     common.check_outputs(arguments, "json", "csv", "report")
     workers = Workers(arguments.jobs, arguments.dask)
     if are_bags:

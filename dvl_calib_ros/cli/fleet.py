@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..errors import InputError
 from . import common
 
 
@@ -35,8 +34,6 @@ def run(arguments: argparse.Namespace) -> None:
     from ..present.comparison import fleet as present
     from ..present.page import write_report
 
-    if arguments.jobs < 0:
-        raise InputError(f"--jobs: {arguments.jobs} is negative; give a number of processes, or 0 for one per core")
     parameters, given = common.load(arguments), common.given(arguments)
     workers = Workers(arguments.jobs, arguments.dask)
     with common.progress("calibrating") as on_progress:

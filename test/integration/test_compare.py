@@ -132,8 +132,8 @@ def test_a_result_with_a_field_missing_or_without_samples_is_one_line(place, tmp
 
 def test_one_alone_twice_the_same_and_a_file_that_is_not_there_are_one_line(place, tmp_path, capsys):
     a = place / "a.yaml"
-    assert "one calibration cannot be compared" in fail(capsys, "compare", a)
-    assert "named twice" in fail(capsys, "compare", a, a)
+    assert "one alone cannot be compared; name two" in fail(capsys, "compare", a)
+    assert "cannot be compared with itself" in fail(capsys, "compare", a, a)
     (tmp_path / "copy.yaml").write_bytes(a.read_bytes())
     for other in (tmp_path / "copy.yaml", place / "a"):  # the bag that it is from
         assert "are the same calibration" in fail(capsys, "compare", place / "b.yaml", a, other)

@@ -353,7 +353,7 @@ def test_without_a_folder_the_command_says_that_the_trajectories_are_its_own(cap
         (["--models", "M9"], "--models: 'M9' is none of"),
         (["--sets", "E5"], "--sets: 'E5' is none of"),
         (["--seeds", "0"], "--seeds: 0 is outside"),
-        (["--jobs", "-2"], "--jobs: -2 is negative"),
+        (["--jobs", "-2"], "jobs: -2 is no number of processes"),
         (["--json", "no/such/e.json"], "no/such"),
         (["--json", "same", "--csv", "same"], "--json and --csv: both write same"),
         (["nowhere"], "nowhere: no such file or folder"),
