@@ -353,11 +353,12 @@ def next_commands(
     run: Replayed, bags: Sequence[Path], saved: Path | None, options: Sequence[str], doubts: bool
 ) -> list[str]:
     """Return the commands to type next, in order. options: options of this run that the next one needs."""
-    verdict = run.result.verifications[run.result.selected].verdict
-    if verdict is Severity.REJECT:
-        moved = run.recordings is not None and run.recordings.moved
-        found, doctor = (typed(command, bags, *options) for command in ("compare" if moved else "diagnose", "doctor"))
-        return [found, doctor] if moved else [doctor, found]
+    verification = run.result.verifications[run.result.selected]
+    if verification.verdict is Severity.REJECT:
+        apart = any(reason.code.startswith("BAGS_") for reason in verification.reasons)
+        apart |= run.recordings is not None and bool(run.recordings.moved)
+        found, doctor = (typed(command, bags, *options) for command in ("compare" if apart else "diagnose", "doctor"))
+        return [found, doctor] if apart else [doctor, found]
     if saved is None:
         return [typed("replay", bags, *options, "--save", "calibration.yaml")]
     commands = [typed("apply", [saved], "--urdf", "robot.urdf")]
