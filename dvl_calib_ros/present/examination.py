@@ -11,7 +11,7 @@ from ..verdict.kinds import Severity
 from .document import Answer, Columns, Commands, Document, FindingLine, Section, Sentence, bar, table_by
 from .numbers import options, typed
 
-SHOWN_NOTE = "A full bar is fine (target_drift); red is not observable, yellow is between."
+SHOWN_NOTE = "A full bar is fine (target_drift). Not observable: rows with an entry in 'needs'."
 NO_REFERENCE = "Without a reference only pitch is observable, and yaw on opposite headings."
 NO_SAMPLE = "Nothing is observable without a usable sample."
 ANSWERS = {
