@@ -280,7 +280,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
     elif run.reference_frame in EARTH:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
-        yield Sentence(f"{axes} (?): not observable in this recording; it needs {lacks}")
+        yield Sentence(f"{axes} (?): not observable in this recording; needed: {lacks}")
     if (cause := run.cause_of_scale) is not None:
         yield Sentence(cause.sentence)
     if run.result.iac_model in run.result.estimates and run.result.iac_model != run.result.selected:
