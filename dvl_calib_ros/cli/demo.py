@@ -101,7 +101,7 @@ def _show_live(out: Any, bag: Path, speed: float) -> None:
     with Live(console=out, refresh_per_second=5, get_renderable=watcher.render, transient=False) as live:
         watcher.run(speed, switch_at_s=470.0, switch_to="M4", back_at_s=500.0)
         live.refresh()
-    out.print()
+    out.print("\nThis was its last message. As the node ends, it uses the samples that still wait, and saves.\n")
 
 
 def _truth() -> dict[str, float]:
