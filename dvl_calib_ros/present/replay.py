@@ -81,8 +81,8 @@ RESIDUALS = (
 )
 HELD_OUT_NOTE = (
     "Each block of the run was held back in turn and corrected with a calibration that had not seen it. Velocity error "
-    "against the reference, m/s rms, with the noise of the reference in all of them; predicted is what that noise and "
-    "the uncertainty of the calibration lead one to expect."
+    "against the reference, m/s rms, with the noise of the reference in all of them. A delay moves the times at which "
+    "the reference is interpolated, and so changes this noise. Predicted: by this noise and the calibration's σ."
 )
 HELD_OUT: Columns[Verification] = {
     "model": lambda each: each.model,
