@@ -193,7 +193,6 @@ LIMITS = {
     "gyro_bias": (-100.0, 100.0),
     "motion_smoothing": (0.0, 60.0),
 }
-MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # zero means no such sensor
 
 
 def _check_ranges(arguments: argparse.Namespace) -> None:
@@ -203,7 +202,7 @@ def _check_ranges(arguments: argparse.Namespace) -> None:
     for name, (low, high) in LIMITS.items():
         given = getattr(arguments, name)
         for value in given if isinstance(given, list | tuple) else [] if given is None else [given]:
-            if not low <= value <= high and not (value == 0.0 and name in MAY_BE_ZERO):
+            if not low <= value <= high and not (value == 0.0 and name in ("gnss_rate", "imu_rate")):  # no sensor
                 raise InputError(f"--{name.replace('_', '-')}: {value:g} is outside {low:g} .. {high:g}")
     if arguments.waves and not (0.0 <= arguments.waves[0] <= 10.0 and 1.0 <= arguments.waves[1] <= 30.0):
         raise InputError("--waves: give a height of 0 .. 10 m, then a period of 1 .. 30 s")
