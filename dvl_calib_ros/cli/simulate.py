@@ -242,8 +242,9 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     if not arguments.live:
         if arguments.output is None:
             raise InputError("name a bag to write, or publish with --live")
-        if arguments.follow is not None:
-            raise InputError("--follow needs --live")
+        for name in ("follow", "speed", "wait", "dvl_type", "dvl_topic", "gnss_topic", "imu_topic"):
+            if getattr(arguments, name) != getattr(defaults, name):
+                raise InputError(f"--{name.replace('_', '-')} needs --live")
         return
     if arguments.output is not None:
         raise InputError(f"{arguments.output}: --live publishes and writes no bag; leave the name out")
@@ -254,8 +255,7 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     if arguments.follow is not None:
         for name in (*MOTION_OPTIONS, "speed"):
             if getattr(arguments, name) != getattr(defaults, name):
-                option = f"--{name.replace('_', '-')}"
-                raise InputError(f"{option}: the motion comes from {arguments.follow}; leave out {option}")
+                raise InputError(f"--{name.replace('_', '-')}: the motion comes from {arguments.follow}; leave it out")
 
 
 def run_live(arguments: argparse.Namespace, scenario: Scenario) -> None:
