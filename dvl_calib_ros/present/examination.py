@@ -30,10 +30,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
     found = (*found, *(each for each in examined.against if each.says not in {one.says for one in found}))
-    notes = (note.sentence for note in discovery.notes)
-    lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
-    motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
-    otherwise = "else " if examined.notes else ""
+    lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *(note.sentence for note in discovery.notes))]
     nothing = NO_SAMPLE if examined.has_reference else NO_REFERENCE
     return Document(
         title="Examination of a recording",
@@ -43,11 +40,11 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
         sections=[
             Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *lines]),
             Section(
-                f"Findings: {len(found)}" if found else f"Nothing {otherwise}wrong was found",
+                f"Findings: {len(found)}" if found else f"Nothing {'else ' if examined.notes else ''}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(
-                motion,
+                f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)",
                 [table_by(SHOWN, examined.shown, (SHOWN_NOTE,), words=4)] if examined.shown else [Sentence(nothing)],
             ),
             Section("", [Commands(next_commands(examined, is_live, named))]),

@@ -241,8 +241,8 @@ def _verdict_answer(verification: Verification | None) -> Answer:
     reasons = [*verification.reasons]
     if verification.mounting is not None and verification.verdict is not Severity.REJECT:
         reasons.append(verification.mounting)
-    sentences = [each.full_sentence for each in reasons]
-    return Answer(verification.verdict.value, verification.verdict, sentences, ADVICE[verification.verdict])
+    verdict = verification.verdict
+    return Answer(verdict.value, verdict, [each.full_sentence for each in reasons], ADVICE[verdict])
 
 
 def _headline(run: Replayed, rejected: bool) -> str:
