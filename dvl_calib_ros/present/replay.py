@@ -333,7 +333,7 @@ def _held_out(result: Result, models: Sequence[str]) -> Iterator[Item]:
 def _over_time(run: Replayed, names: Sequence[str]) -> Iterator[Section]:
     """Yield estimates over time and innovations, for models with and without GNSS; velocities."""
     result, history = run.result, run.history
-    if history is None:
+    if history is None or len(history.stamps_ns) < 2:  # nothing to draw over time
         return
     for aided, title in FAMILIES:
         models = [name for name in names if MODELS[name].aided == aided and result.estimates[name].used]

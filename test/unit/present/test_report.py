@@ -141,6 +141,12 @@ def test_warnings_are_shown(tmp_path, monkeypatch):
     assert others and all(note in text for note in others)
 
 
+def test_nothing_is_drawn_over_the_time_of_a_single_sample(tmp_path, monkeypatch):
+    figures = drawn(monkeypatch)
+    replay_page(tmp_path, [sample for sample in run() if isinstance(sample, DvlSample)][:2])
+    assert len(figures) == 2  # samples by model, selection
+
+
 @pytest.mark.slow
 def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypatch):
     figures = drawn(monkeypatch)
