@@ -87,7 +87,7 @@ def not_shown(result: Result) -> dict[str, str]:
     for name in ("roll", "pitch", "yaw"):
         if name not in shown.union(*causes.values()):
             causes.setdefault(missing_for(name, result.estimate), {})[name] = None
-    return {missing: " and ".join(axes) for missing, axes in causes.items()}
+    return {missing: " and ".join(axes).replace("time offset", LATE) for missing, axes in causes.items()}
 
 
 def missing_for(name: str, estimate: Estimate) -> str:

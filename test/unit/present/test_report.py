@@ -432,6 +432,7 @@ def test_an_axis_that_is_not_shown_is_the_vehicles_where_the_angle_of_that_name_
     named = " and ".join(not_shown(straight(yaw)).values()).split(" and ")
     assert ("roll" in named, "the vehicle's roll axis" in named) == (not shown["roll"], shown["roll"])
     assert ("pitch" in named) == (not shown["pitch"])
+    assert set(named) - set(shown) <= {"the vehicle's roll axis"}  # the words of the table
 
 
 def test_of_a_dvl_mounted_across_it_is_the_pitch_that_a_straight_leg_does_not_show():
