@@ -45,8 +45,8 @@ class Workers:
 
     def __post_init__(self) -> None:
         """Check the number of processes."""
-        if self.jobs < 0:
-            raise InputError(f"--jobs: {self.jobs} is negative; give a number of processes, or 0 for one per core")
+        if not isinstance(self.jobs, int) or self.jobs < 0:
+            raise InputError(f"jobs: {self.jobs!r} is no number of processes; give 0 for one per core")
 
 
 @dataclass(frozen=True)

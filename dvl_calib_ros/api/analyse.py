@@ -35,9 +35,17 @@ StrPath = str | os.PathLike[str]
 Bags = StrPath | Sequence[StrPath]
 
 
+def path_of(given: StrPath) -> Path:
+    """Return a path as such. Raises InputError for anything else."""
+    try:
+        return Path(given)
+    except TypeError:
+        raise InputError(f"expected a path, not {type(given).__name__}; save a result first, name its file") from None
+
+
 def as_path(given: StrPath | None) -> Path | None:
-    """Return a path as such, or None."""
-    return None if given is None else Path(given)
+    """Return a path as such, or None. Raises InputError for anything else."""
+    return None if given is None else path_of(given)
 
 
 def storage_and_compression(storage: str, compression: str) -> tuple[Storage, Compression]:
@@ -66,7 +74,7 @@ def parameters_from(params: StrPath | None, given: Mapping[str, Any]) -> tuple[P
     """Merge the parameters of a file and of a call; also return the names that either sets."""
     from ..files.parameter_files import given_parameters, load_parameters
 
-    path = None if params is None else Path(params)
+    path = as_path(params)
     return load_parameters(path).replace(**given), given_parameters(path) | frozenset(given)
 
 
@@ -133,7 +141,7 @@ def diagnose(
 
         sides = [discovered_in(as_paths(each), topics, params, slow) for each in (bags, simulator)]
         real, simulated = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
-        return against(real, simulated, rounds, None if keep is None else Path(keep))
+        return against(real, simulated, rounds, as_path(keep))
     if rounds is not None or keep is not None:
         raise InputError("rounds, keep: only with simulator")
     from ..diagnosis.diagnose import diagnose as run
@@ -161,7 +169,8 @@ def simulate(
     effects
         Effects by name, each with its parameters, such as ``{"lever_arm": {"x_m": 0.5}}``.
     **scenario_fields
-        Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``.
+        Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``. A misaligned DVL is
+        ``errors=DvlErrors(misalignment_rpy=(0.0, 0.0, 0.05))``, with DvlErrors of dvl_calib_ros.simulation.sensors.
 
     Returns
     -------
@@ -178,7 +187,7 @@ def simulate(
 
     if scenario is not None and scenario_fields:
         raise InputError("simulate: give a scenario or fields of one, not both")
-    target, made = Path(bag), scenario or _scenario(scenario_fields)
+    target, made = path_of(bag), scenario or _scenario(scenario_fields)
     if effects is not None:
         if not isinstance(effects, Mapping):
             raise InputError("simulate: give effects by name, such as {'lever_arm': {'x_m': 0.5}}")
@@ -199,8 +208,10 @@ def _scenario(given: Mapping[str, Any]) -> Scenario:
             raise InputError(f"simulate: waves={value!r}; expected Waves(height=0.5, period=6.0) (m, s)")
         if name == "trajectory" and value not in TRAJECTORIES:
             raise InputError(f"simulate: trajectory={value!r}; there are {', '.join(TRAJECTORIES)}")
-        if (name == "seconds" or name.endswith(("_rate", "_std"))) and not isinstance(value, int | float | None):
-            raise InputError(f"simulate: {name}={value!r}; expected a number")
+        if value is not None and (name == "seconds" or name.endswith(("_rate", "_std"))):
+            least = {"seconds": 1.0, "dvl_rate": 0.01}.get(name, 0.0)  # s, Hz
+            if not isinstance(value, int | float) or not value >= least:
+                raise InputError(f"simulate: {name}={value!r}; expected a number from {least:g} on")
     return Scenario(**given)
 
 
@@ -364,10 +375,7 @@ def compare(
 
 def _names(results: Sequence[StrPath | Calibration]) -> list[str]:
     """Return the names of files and bags without folders if they are unique, else their paths. Raises InputError."""
-    for each in results:
-        if not isinstance(each, str | os.PathLike | Calibration):
-            raise InputError(f"compare: {each!r}; expected result files, bags or return values of replay")
-    paths = [list(each.bags) if isinstance(each, Calibration) else [Path(each)] for each in results]
+    paths = [list(each.bags) if isinstance(each, Calibration) else [path_of(each)] for each in results]
     short = [", ".join(path.name or str(path) for path in of_one) for of_one in paths]
     return short if len(set(short)) == len(short) else [", ".join(map(str, of_one)) for of_one in paths]
 
@@ -426,7 +434,7 @@ def fleet(
     merged, names = parameters_from(params, parameters)
     places_as_text = [str(each) for each in ([places] if isinstance(places, str | os.PathLike) else places)]
     given = Given(dvl_topic, gnss_topic, imu_topic, names)
-    found = run_fleet(places_as_text, Path(out), merged, given, Workers(jobs, dask), vehicle_from)
+    found = run_fleet(places_as_text, path_of(out), merged, given, Workers(jobs, dask), vehicle_from)
     write_report(found.page, found)
     return found
 

@@ -11,7 +11,7 @@ from ..diagnosis.answer.results import Diagnosis
 from ..disk.text_files import write_json
 from ..errors import InputError, needing_page
 from ..examination.examine import Examination
-from .analyse import Bags, StrPath, as_path, as_paths, storage_and_compression
+from .analyse import Bags, StrPath, as_path, as_paths, path_of, storage_and_compression
 from .calibrated import Calibration
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def salvage(bags: Bags, output: StrPath, *, storage: str = "mcap", compression: 
     """
     from ..bags.writer import recover
 
-    return recover(as_paths(bags), Path(output), *storage_and_compression(storage, compression))
+    return recover(as_paths(bags), path_of(output), *storage_and_compression(storage, compression))
 
 
 def import_files(
@@ -104,7 +104,7 @@ def import_files(
     options = ImportOptions(
         frame, gnss_frame, dvl_std, gnss_std, start, columns, *storage_and_compression(storage, compression)
     )
-    return run(Path(dvl), as_path(gnss), as_path(attitude), Path(output), options)
+    return run(path_of(dvl), as_path(gnss), as_path(attitude), path_of(output), options)
 
 
 def apply(
@@ -158,7 +158,7 @@ def apply(
     targets = Targets(
         as_path(urdf), as_path(output), joint, keep_position, as_path(params), as_path(launch), as_path(fusion)
     )
-    return write_calibration(load_calibrated_mounting(Path(result)), targets, force, dry_run)
+    return write_calibration(load_calibrated_mounting(path_of(result)), targets, force, dry_run)
 
 
 def instrument_settings(
@@ -191,7 +191,7 @@ def instrument_settings(
     from ..files.mounting import load_calibrated_mounting
     from ..instruments.settings import instrument_settings as settings_of
 
-    return settings_of(load_calibrated_mounting(Path(result)), instrument, now, force)
+    return settings_of(load_calibrated_mounting(path_of(result)), instrument, now, force)
 
 
 def export(simulator: str, source: StrPath, output: StrPath) -> Export:
@@ -218,7 +218,7 @@ def export(simulator: str, source: StrPath, output: StrPath) -> Export:
     """
     from ..simulator_export.simulators import write_settings
 
-    return write_settings(simulator, Path(source), Path(output))
+    return write_settings(simulator, path_of(source), path_of(output))
 
 
 def report(
@@ -248,7 +248,7 @@ def report(
     """
     from ..present.result_documents import PLAIN_DATA
 
-    target, kind = Path(path), type(result)
+    target, kind = path_of(path), type(result)
     if not isinstance(result, Calibration) and kind not in PLAIN_DATA:
         raise InputError(
             f"a {kind.__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"

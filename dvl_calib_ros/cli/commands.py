@@ -30,7 +30,7 @@ COMMANDS = (
     Command(
         "run",
         "run the calibration node, live",
-        "dvl-calib run --params calibration.yaml --dvl-topic /dvl/velocity -p result_file:=/data/calibration.yaml",
+        "dvl-calib run --params vehicle.yaml --dvl-topic /dvl/velocity -p result_file:=/data/calibration.yaml",
     ),
     Command(
         "watch",
@@ -98,7 +98,7 @@ COMMANDS = (
     Command(
         "parameters",
         "list every parameter, model, effect, driver, warning or command, or write a parameter file",
-        "dvl-calib parameters --yaml > calibration.yaml",
+        "dvl-calib parameters --yaml > vehicle.yaml",
     ),
     Command("demo", "live node, replay and truth side by side on a shipped bag", "dvl-calib demo --speed 5"),
 )

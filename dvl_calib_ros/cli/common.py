@@ -169,26 +169,24 @@ def check_outputs(
     """
     from ..disk.atomic import check_folder_writable, check_writable
     from ..files.output_paths import check_outputs as check_apart
+    from ..files.output_paths import check_report_name
 
     given = {name: value for name, value in vars(arguments).items() if isinstance(value, Path)}
-    for name in files:
-        if name in given:
-            check_writable(given[name])
-    for path in (also_written or {}).values():
+    for path in [*(given[name] for name in files if name in given), *(also_written or {}).values()]:
         check_writable(path)
     read = [*also_read, *(path for name, path in given.items() if name not in (*files, *folders))]
     read += [path for value in vars(arguments).values() if isinstance(value, list) for path in value
              if isinstance(path, Path)]  # fmt: skip
     if hasattr(arguments, "overrides") and (initial := load(arguments).initial_calibration):
         read.append(Path(initial))
-    for name in folders:
-        if name in given and os.path.islink(given[name]) and not given[name].exists():
-            raise InputError(f"{given[name]}: is a link that leads nowhere; give another name, or remove it first")
-        if name in given:
-            check_folder_writable(given[name])
+    for folder in (given[name] for name in folders if name in given):
+        if os.path.islink(folder) and not folder.exists():
+            raise InputError(f"{folder}: is a link that leads nowhere; give another name, or remove it first")
+        check_folder_writable(folder)
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
     check_apart(as_options[0] | dict(also_written or {}), read, as_options[1])
     if "report" in given:
+        check_report_name(given["report"], *([".png"] if arguments.command == "compare" else []))
         with needing_page("--report"):
             from ..present import page  # noqa: F401
 

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
 from ..standard_streams import give_up
 from . import common
 
@@ -37,11 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ..present import comparison as present
 
     paths: list[Path] = arguments.results
-    if len(paths) < 2:
-        raise InputError(f"{paths[0]}: one calibration cannot be compared; name two at least")
-    if len(set(paths)) < len(paths):
-        twice = next(path for path in paths if paths.count(path) > 1)
-        raise InputError(f"{twice}: named twice; a calibration cannot be compared with itself")
     common.check_outputs(arguments, "json", "report")
     names = _names(paths)
     notes: list[str] = []

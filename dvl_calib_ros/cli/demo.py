@@ -102,6 +102,7 @@ def _show_live(out: Any, bag: Path, speed: float) -> None:
         watcher.run(speed, switch_at_s=470.0, switch_to="M4", back_at_s=500.0)
         live.refresh()
     out.print()
+    out.print("This was its last message. As the node ends, it uses the samples that still wait, and saves.")
 
 
 def _truth() -> dict[str, float]:
@@ -127,7 +128,6 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     from ..present.terminal import rich_table
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`")
-    out.print()
     content, live = load_result(saved)
     found = estimate_table(offline, list(offline.estimates))
     truth = ("truth", *(f"{value:+.2f}" for value in _truth().values()))

@@ -34,6 +34,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError("give: list, get NAME, or set NAME VALUE")
     if name is not None and name not in SCHEMA:
         load_parameters(None, [f"{name}:=0"])  # raises InputError with the nearest name
+    if what == "set" and SCHEMA[name].read_only:
+        raise InputError(f"{name}: a running node does not change it; start the node with -p {name}:={value}")
     new = load_parameters(None, [f"{name}:={value}"]).as_dict()[name] if what == "set" else None
     with common.ros_node("param", "dvl_calib_param") as (node, _):
         from rclpy.parameter import Parameter, parameter_value_to_python

@@ -110,7 +110,7 @@ def _check_arguments(arguments: argparse.Namespace) -> None:
     """Raise InputError for an option outside its range."""
     for name, (low, high) in (("rate", RATES), ("clock", CLOCKS_HZ)):
         value = getattr(arguments, name)
-        if value and not low <= value <= high:
+        if not low <= value <= high and (value or name == "rate"):
             raise InputError(f"--{name}: {value:g} is outside {low:g} .. {high:g}")
     if not arguments.playback_duration > 0.0:
         raise InputError("--playback-duration: give a number of seconds, above 0")

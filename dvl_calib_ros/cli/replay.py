@@ -104,7 +104,7 @@ def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discove
 def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Reason]:
     """Return the findings to print: only of requested models, and none that discovery has settled."""
     other = [f"{name}: " for name in replayed.result.estimates if name not in models]
-    settled = {"BAG_NO_GNSS", "BAG_NO_IMU"} | ({"IMU_FRAME"} if discovery.knows_imu else set())
+    settled = {"BAG_NO_GNSS"} | ({"IMU_FRAME"} if discovery.knows_imu else set())
     return [
         found
         for found in replayed.findings

@@ -193,7 +193,6 @@ LIMITS = {
     "gyro_bias": (-100.0, 100.0),
     "motion_smoothing": (0.0, 60.0),
 }
-MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # zero means no such sensor
 
 
 def _check_ranges(arguments: argparse.Namespace) -> None:
@@ -203,7 +202,7 @@ def _check_ranges(arguments: argparse.Namespace) -> None:
     for name, (low, high) in LIMITS.items():
         given = getattr(arguments, name)
         for value in given if isinstance(given, list | tuple) else [] if given is None else [given]:
-            if not low <= value <= high and not (value == 0.0 and name in MAY_BE_ZERO):
+            if not low <= value <= high and not (value == 0.0 and name in ("gnss_rate", "imu_rate")):  # no sensor
                 raise InputError(f"--{name.replace('_', '-')}: {value:g} is outside {low:g} .. {high:g}")
     if arguments.waves and not (0.0 <= arguments.waves[0] <= 10.0 and 1.0 <= arguments.waves[1] <= 30.0):
         raise InputError("--waves: give a height of 0 .. 10 m, then a period of 1 .. 30 s")
@@ -243,8 +242,9 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     if not arguments.live:
         if arguments.output is None:
             raise InputError("name a bag to write, or publish with --live")
-        if arguments.follow is not None:
-            raise InputError("--follow needs --live")
+        for name in ("follow", "speed", "wait", "dvl_type", "dvl_topic", "gnss_topic", "imu_topic"):
+            if getattr(arguments, name) != getattr(defaults, name):
+                raise InputError(f"--{name.replace('_', '-')} needs --live")
         return
     if arguments.output is not None:
         raise InputError(f"{arguments.output}: --live publishes and writes no bag; leave the name out")
@@ -255,8 +255,7 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     if arguments.follow is not None:
         for name in (*MOTION_OPTIONS, "speed"):
             if getattr(arguments, name) != getattr(defaults, name):
-                option = f"--{name.replace('_', '-')}"
-                raise InputError(f"{option}: the motion comes from {arguments.follow}; leave out {option}")
+                raise InputError(f"--{name.replace('_', '-')}: the motion comes from {arguments.follow}; leave it out")
 
 
 def run_live(arguments: argparse.Namespace, scenario: Scenario) -> None:

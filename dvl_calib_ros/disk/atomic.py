@@ -176,7 +176,7 @@ def _target(path: Path) -> Path:
     with suppress(FileNotFoundError, NotADirectoryError):
         mode = target.stat().st_mode
         if stat.S_ISDIR(mode):
-            raise InputError(f"{path}: is a folder; name a file in it, such as {path / 'calibration.yaml'}")
+            raise InputError(f"{path}: is a folder; name a file in it")
         if not stat.S_ISREG(mode):
             raise InputError(f"{path}: is a device, a pipe or a socket, which a file would replace; name a file")
     if len(os.fsencode(target.name)) > LONGEST_NAME:

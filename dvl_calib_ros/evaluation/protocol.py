@@ -157,11 +157,11 @@ def load_folder(folder: Path, partial: bool = False) -> tuple[dict[str, Trajecto
 
 def _check_missing(folder: Path, missing: list[str], partial: bool) -> None:
     """Raise InputError for missing trajectories, unless `partial` and enough others."""
-    files = ", ".join(f"{name}_dvl.csv" for name in missing)
+    files = ", ".join(f"{name}_dvl.csv" for name in missing[:3]) + (" and more" if len(missing) > 3 else "")
     needed = [each.calibration_run for each in SETS]
     enough = not set(needed) & set(missing) and len(TRAJECTORIES) - len(missing) >= len(needed) + MIN_OTHERS
     if missing and not enough:
-        raise InputError(f"{folder}: {files} missing; needs {', '.join(needed)} and {MIN_OTHERS} other trajectories")
+        raise InputError(f"{folder}: {files} missing; needs {', '.join(needed)} and {MIN_OTHERS} others, or two bags")
     if missing and not partial:
         raise InputError(f"{folder}: {files} missing; fetch these files, or continue without them by --partial")
 

@@ -13,13 +13,12 @@ import numpy as np
 from ..bag_replay.checked_replay import checked_replay
 from ..bag_replay.replay import Replayed
 from ..calibration.filters.observability import KM, PredictedDrift
-from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.samples import Stream, VelocityFrame
 from ..calibration.numerics.tests import Z_ONE_TEST
 from ..calibration.registration.frame_hypotheses import MAX_RESIDUAL
-from ..calibration.results.mounting_quantities import Quantity, quantities
+from ..calibration.results.mounting_quantities import Quantity, missing_for, quantities
 from ..calibration.results.results import Estimate
 from ..calibration.streams.position_velocities import NOISY_MPS
 from ..discovery.discover import discover
@@ -37,8 +36,6 @@ from . import topic_checks
 
 # a reference below this rate (Hz) interpolates turns by straight lines; 1 Hz receivers are a little slow at times
 SLOW_REFERENCE = 0.8
-# prefix of the findings that are reported first
-NO_IMU = "DOCTOR_NO_IMU"
 # ratios of speeds outside this range mean different units
 UNIT_FACTORS = (0.7, 1.4)
 UNITS = {
@@ -114,12 +111,11 @@ class Examination(Answering):
             return self.against[0].full_sentence
         errors = [reason for reason in self.findings if reason.severity is Severity.ERROR]
         if errors:
-            return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
+            return full(errors[0].says)
         if not self.has_reference and self.verdict != "no":
             return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
         if self.cannot or self.verdict == "no":
-            why = self.cannot or self.against[0].says
-            return full(why)
+            return full(self.cannot or self.against[0].says)
         missing = [reason.name for reason in self.shown if reason.needs]
         listed = " and ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:])))
         return f"Not shown yet: {listed}." if listed else ""
@@ -234,7 +230,7 @@ def judged_replay(
     look = recording.survey.previews.get(streams["dvl"].topic)
     findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
     errors = [reason for reason in findings if _has_error([reason])]
-    if not errors or errors[0].code.startswith(NO_IMU):  # that there is no IMU is said before the verdict
+    if not errors or errors[0].code == "DOCTOR_NO_IMU_EARTH":  # the replay has its own finding
         return replayed
     judged = judged.with_objections([errors[0].weighed(Severity.REJECT)])
     result = replace(result, verifications={**result.verifications, result.selected: judged})
@@ -330,7 +326,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         found.append(finding("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
     elif reference is not None and not over_legs:
         found += _disagreement(discovery, topic_checks.shown_noise(reference.values) / float(np.median(speed)))
-    return sorted(found, key=lambda each: (not each.code.startswith(NO_IMU), each.severity is not Severity.ERROR))
+    return sorted(found, key=lambda each: each.severity is not Severity.ERROR)
 
 
 def _is_compared_over_legs(reference: Recorded) -> bool:
@@ -409,8 +405,7 @@ def _one_shown(quantity: Quantity, estimate: Estimate, parameters: Parameters) -
         unit, prior = 100.0, parameters.initial_std_scale
     else:
         unit, prior = math.degrees(1.0), parameters.initial_std_misalignment
-    missing = (entry.missing for entry in estimate.observability if entry.axis == quantity.name and entry.missing)
-    needs = "" if quantity.shown else next(missing, MODELS[estimate.model].shown_by[quantity.name])
+    needs = "" if quantity.shown else missing_for(quantity.name, estimate)
     fine = PredictedDrift.goals(parameters).side / KM
     way = math.log(prior * unit / max(quantity.std, 1e-12)) / max(math.log(prior / fine), 1e-9)
     return Shown(quantity.name, quantity.unit.strip(), quantity.std, min(1.0, max(0.0, way)), needs)

@@ -42,6 +42,13 @@ def check_outputs(files: Mapping[str, Path], inputs: Iterable[Path], folders: Ma
             raise InputError(f"{one} and {other}: both write {b.path} or its backup; give each a name of its own")
 
 
+def check_report_name(path: Path, *further: str) -> None:
+    """Raise InputError for a report whose name ends as another kind of file. further: endings other than .html."""
+    kinds = (".html", *further)
+    if path.suffix and path.suffix.lower() not in (".htm", *kinds):
+        raise InputError(f"{path}: a report is a page (HTML); give a name that ends in {' or '.join(kinds)}")
+
+
 @dataclass(frozen=True)
 class _Written:
     """An output, and the other paths that change with it."""

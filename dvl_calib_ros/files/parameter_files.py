@@ -140,7 +140,10 @@ def _own_sections(
         if not isinstance(body, dict):
             raise InputError(f"{path}: ros__parameters of {name} is not a list of name: value")
     if not sections:
-        raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
+        remedy = "put parameters under '/**:' and 'ros__parameters:'"
+        if str(content.get("format")).startswith("dvl_calib_ros result"):
+            remedy = "it is a result file, which -p initial_calibration:=FILE and dvl-calib apply take"
+        raise InputError(f"{path}: no ros__parameters in it; {remedy}")
     if not own_sections:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
         raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; name '/**:' or the node")
@@ -214,8 +217,8 @@ def parameter_file_text() -> str:
     """Return `config/calibration.yaml`: every parameter at its default, with its description."""
     lines = [
         "# Every parameter of dvl_calib_ros at its default. An ordinary ROS 2 parameter file:",
-        "#   ros2 run dvl_calib_ros calibration_node --ros-args --params-file calibration.yaml",
-        "#   dvl-calib replay BAG --params calibration.yaml",
+        "#   ros2 run dvl_calib_ros calibration_node --ros-args --params-file vehicle.yaml",
+        "#   dvl-calib replay BAG --params vehicle.yaml",
         "/**:",
         "  ros__parameters:",
     ]

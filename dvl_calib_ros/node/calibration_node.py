@@ -115,9 +115,9 @@ class CalibrationNode(AnsweringNode):
         self._published = self._mounting_published = self._iac_published = ("", 0)
         self._pauses = Pauses(steady_s())
         self._save_problem: Reason | None = None
+        self._logged: set[str] = set()  # codes of findings
 
-        self._estimate = empty_twist()
-        self._corrected = empty_twist()
+        self._estimate, self._corrected = empty_twist(), empty_twist()
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", LATCHED)
         self._iac_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", LATCHED)
@@ -158,8 +158,8 @@ class CalibrationNode(AnsweringNode):
         self.add_post_set_parameters_callback(self._apply_parameters)
         # steady: diagnostics continue while simulated time stands still or jumps
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        in_use = changed_parameters(self._calibrator.parameters)
-        changed = ", ".join(f"{name}: {value}" for name, value in in_use.items())
+        in_use = changed_parameters(self._calibrator.parameters).items()
+        changed = ", ".join(f"{name}: {value}" for name, value in in_use)
         self.info(f"model {parameters.model}; parameters not at their default: {changed or 'none'}")
 
     def _named_topics(self, *, has_dvl: bool) -> dict[str, str | None]:
@@ -431,8 +431,7 @@ class CalibrationNode(AnsweringNode):
         subscribed = [subscription.topic_name for subscription in self._inputs.values()]
         dvl = (self._inputs["dvl/twist"].topic_name, decoder.dvl_type.name, self._newest_dvl)
         self._water, self._newest_dvl = self._water_heard.update(subscribed, dvl), None
-        if self._save_problem:
-            problems.append(self._save_problem)
+        problems += [self._save_problem] if self._save_problem else []
         now_s = self._pauses.running_s(steady_s())
         status = diagnose(
             self._calibrator, decoder.dvl_type, problems, self._silence, self._recent, now_s,
@@ -442,6 +441,10 @@ class CalibrationNode(AnsweringNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
+        for each in status.values:
+            if each.key.startswith("finding ") and (code := each.value.rpartition("[")[2]) not in self._logged:
+                self._logged.add(code)
+                self.warn(each.value)
 
     def _topic_problems(self) -> list[Reason]:
         """Return the problems with publishers and subscribers of all topics."""

@@ -337,7 +337,6 @@ class Document(_Printable):
 
     sections: in order; empty ones are omitted.
     parameters: parameters of the run by name, for the page.
-    lead: a finding before all others.
     folded: warnings that a page folds away.
     """
 
@@ -347,7 +346,6 @@ class Document(_Printable):
     warnings: Sequence[str]
     sections: Sequence[Section]
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    lead: Reason | None = None
     folded: Sequence[str] = ()
 
     @property

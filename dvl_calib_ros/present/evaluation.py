@@ -323,8 +323,8 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
 
 
 ERRORS_NOTE = (
-    "rms of the vector, m/s, with the noise of GNSS, which no calibration removes; – nothing to calibrate with, or to "
-    "check against."
+    "rms of the vector, m/s, with the noise of GNSS. A delay moves the times at which GNSS is interpolated, and with "
+    "them this noise: judge such a model by its drift. – nothing to calibrate with, or to check against."
 )
 DRIFT_NOTE = (
     "Drift in m per km, and per cent of the distance, rms over stretches of up to 1 km. With the lever arm of the "

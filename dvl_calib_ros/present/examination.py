@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..examination.examine import NO_IMU, Content, Examination, Shown
+from ..examination.examine import Content, Examination, Shown
 from ..files.parameter_files import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from .document import Answer, Columns, Commands, Document, FindingLine, Section, Sentence, bar, table_by
 from .numbers import options, typed
 
-SHOWN_NOTE = "A full bar is fine (target_drift); red is not observable, yellow is between."
+SHOWN_NOTE = "A full bar is fine (target_drift). Not observable: rows with an entry in 'needs'."
 NO_REFERENCE = "Without a reference only pitch is observable, and yaw on opposite headings."
 NO_SAMPLE = "Nothing is observable without a usable sample."
 ANSWERS = {
@@ -29,12 +29,8 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     severity, answer = ANSWERS[examined.verdict]
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
-    lead, found = (found[0], found[1:]) if found and found[0].code.startswith(NO_IMU) else (None, found)
     found = (*found, *(each for each in examined.against if each.says not in {one.says for one in found}))
-    notes = (note.sentence for note in discovery.notes)
-    lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
-    motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
-    otherwise = "else " if lead or examined.notes else ""
+    lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *(note.sentence for note in discovery.notes))]
     nothing = NO_SAMPLE if examined.has_reference else NO_REFERENCE
     return Document(
         title="Examination of a recording",
@@ -44,16 +40,15 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
         sections=[
             Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *lines]),
             Section(
-                f"Findings: {len(found)}" if found else f"Nothing {otherwise}wrong was found",
+                f"Findings: {len(found)}" if found else f"Nothing {'else ' if examined.notes else ''}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(
-                motion,
+                f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)",
                 [table_by(SHOWN, examined.shown, (SHOWN_NOTE,), words=4)] if examined.shown else [Sentence(nothing)],
             ),
             Section("", [Commands(next_commands(examined, is_live, named))]),
         ],
-        lead=lead,
     )
 
 

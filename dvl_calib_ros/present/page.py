@@ -19,6 +19,7 @@ from markupsafe import Markup, escape
 
 from ..calibration.comparison.mounting_change import Comparison
 from ..disk.atomic import save_bytes, save_text
+from ..files.output_paths import check_report_name
 from ..version import __version__
 from .comparison_figures import trend_png
 from .document import Document, Section, Warned, Where
@@ -93,4 +94,5 @@ def write_report(path: Path, result: Any) -> None:
     if isinstance(result, Comparison) and path.suffix.lower() == ".png":
         save_bytes(path, trend_png(result))
     else:
+        check_report_name(path)
         write_document(path, result if isinstance(result, Document) else DOCUMENTS[type(result)](result))

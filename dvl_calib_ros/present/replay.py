@@ -81,8 +81,8 @@ RESIDUALS = (
 )
 HELD_OUT_NOTE = (
     "Each block of the run was held back in turn and corrected with a calibration that had not seen it. Velocity error "
-    "against the reference, m/s rms, with the noise of the reference in all of them; predicted is what that noise and "
-    "the uncertainty of the calibration lead one to expect."
+    "against the reference, m/s rms, with the noise of the reference in all of them. A delay moves the times at which "
+    "the reference is interpolated, and so changes this noise. Predicted: by this noise and the calibration's σ."
 )
 HELD_OUT: Columns[Verification] = {
     "model": lambda each: each.model,
@@ -171,9 +171,7 @@ def replayed(
     rejected = verification is not None and verification.verdict is Severity.REJECT
     drift = None if rejected else run.navigation
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
-    first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
-    notes = [note for note in run.notes if first is None or note != str(first)]
-    shown_warnings = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
+    shown_warnings = [note for note in run.notes if not note.startswith(others)] if warnings is None else warnings
     where = Where.BOTH if details else Where.PAGE
     streams = [(name, result.counts[key]) for key, name in _STREAMS]
     # an angle that is not observable must not be put on a vehicle
@@ -219,7 +217,6 @@ def replayed(
             ),
         ],
         parameters=result.parameters,
-        lead=first,
         folded=[note for note in run.notes if note.startswith(others)] if warnings is None else (),
     )
 
@@ -244,8 +241,8 @@ def _verdict_answer(verification: Verification | None) -> Answer:
     reasons = [*verification.reasons]
     if verification.mounting is not None and verification.verdict is not Severity.REJECT:
         reasons.append(verification.mounting)
-    sentences = [each.full_sentence for each in reasons]
-    return Answer(verification.verdict.value, verification.verdict, sentences, ADVICE[verification.verdict])
+    verdict = verification.verdict
+    return Answer(verdict.value, verdict, [each.full_sentence for each in reasons], ADVICE[verdict])
 
 
 def _headline(run: Replayed, rejected: bool) -> str:
@@ -283,7 +280,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
     elif run.reference_frame in EARTH:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
-        yield Sentence(f"{axes} (?): not observable in this recording; it needs {lacks}")
+        yield Sentence(f"{axes} (?): not observable in this recording; needed: {lacks}")
     if (cause := run.cause_of_scale) is not None:
         yield Sentence(cause.sentence)
     if run.result.iac_model in run.result.estimates and run.result.iac_model != run.result.selected:
@@ -336,7 +333,7 @@ def _held_out(result: Result, models: Sequence[str]) -> Iterator[Item]:
 def _over_time(run: Replayed, names: Sequence[str]) -> Iterator[Section]:
     """Yield estimates over time and innovations, for models with and without GNSS; velocities."""
     result, history = run.result, run.history
-    if history is None:
+    if history is None or len(history.stamps_ns) < 2:  # nothing to draw over time
         return
     for aided, title in FAMILIES:
         models = [name for name in names if MODELS[name].aided == aided and result.estimates[name].used]
@@ -356,11 +353,12 @@ def next_commands(
     run: Replayed, bags: Sequence[Path], saved: Path | None, options: Sequence[str], doubts: bool
 ) -> list[str]:
     """Return the commands to type next, in order. options: options of this run that the next one needs."""
-    verdict = run.result.verifications[run.result.selected].verdict
-    if verdict is Severity.REJECT:
-        moved = run.recordings is not None and run.recordings.moved
-        found, doctor = (typed(command, bags, *options) for command in ("compare" if moved else "diagnose", "doctor"))
-        return [found, doctor] if moved else [doctor, found]
+    verification = run.result.verifications[run.result.selected]
+    if verification.verdict is Severity.REJECT:
+        apart = any(reason.code.startswith("BAGS_") for reason in verification.reasons)
+        apart |= run.recordings is not None and bool(run.recordings.moved)
+        found, doctor = (typed(command, bags, *options) for command in ("compare" if apart else "diagnose", "doctor"))
+        return [found, doctor] if apart else [doctor, found]
     if saved is None:
         return [typed("replay", bags, *options, "--save", "calibration.yaml")]
     commands = [typed("apply", [saved], "--urdf", "robot.urdf")]

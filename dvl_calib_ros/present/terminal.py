@@ -140,9 +140,7 @@ def shown(document: Document) -> Iterator[Any]:
 
 
 def answer_shown(document: Document) -> Iterator[Any]:
-    """Yield rich's renderables of a document's answer, after the finding that leads it."""
-    if document.lead:
-        yield from _finding_lines(document.lead)
+    """Yield rich's renderables of a document's answer."""
     answer = document.answer
     if answer is not None:
         sentences = list(answer.sentences)

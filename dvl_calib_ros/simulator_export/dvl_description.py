@@ -101,7 +101,7 @@ def load_description(path: Path, sample: int | None = None) -> DvlDescription:
     samples = document.get("samples") if isinstance(document, dict) else None
     samples = samples if isinstance(samples, list) else []
     if sample is not None and not 0 <= sample < len(samples):
-        raise InputError(f"{path}: has {len(samples)} samples, so none of number {sample}; see diagnose --samples")
+        raise InputError(f"{path}: no sample {sample}; it has {len(samples)}, numbered from 0 (see diagnose --samples)")
     if isinstance(document, str):
         return _of_result(path) if document == RESULT else _of_parameters(path)
     if not isinstance(document, dict) or "effects" not in document or "calibration" not in document:

@@ -501,9 +501,9 @@ DOCTOR = on_page(
     ),
     warning(
         "DOCTOR_AXIS",
-        "{topic}: {axes} is exactly zero in every message: not measured",
+        "{topic}: exactly zero along {axes} in every message: not measured",
         means="A receiver that sends course and speed only measures no vertical velocity.",
-        remedy="use a receiver's own velocity (three axes) if pitch matters",
+        remedy="record a velocity of all three axes (a DVL's, or a receiver's own) if pitch matters",
     ),
     warning(
         "DOCTOR_NOT_FINITE",

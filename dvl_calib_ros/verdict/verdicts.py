@@ -116,7 +116,7 @@ VERDICTS = on_page(
     # several recordings
     reject(
         "BAGS_OVERLAP",
-        "{first} and {second} hold the DVL at the same time, so of samples at one time only the first is used",
+        "the DVL is in {first} and in {second} at the same time, so of samples at one time only the first is used",
         means="One recording is given twice, or there are two DVLs.",
         remedy="replay each by itself, and compare them",
     ),

@@ -309,6 +309,8 @@ def test_a_rate_of_0_leaves_a_sensor_out(capsys, tmp_path):
         (["--dvl-rate", "5e-324"], "--dvl-rate"),
         (["--gnss-rate", "-1"], "--gnss-rate: -1"),
         (["--imu-rate", "200"], "--imu-rate: 200 is outside 0.01 .. 100"),
+        (["--dvl-topic", "/a50/velocity"], "--dvl-topic needs --live"),
+        (["--speed", "2"], "--speed needs --live"),
         (["--seed", "-1"], "--seed: -1"),
         (["--misalignment", "1", "nan", "0"], "--misalignment: nan"),
         (["--mounting-rpy", "0", "0", "inf"], "--mounting-rpy: inf"),

@@ -88,6 +88,11 @@ def test_json_and_pictures_say_the_same(place, tmp_path, monkeypatch, capsys):
     assert document["says"][0] in text and text.count("<img") >= 2
     assert main(["compare", *results, "--report", str(png)]) == 4
     assert png.read_bytes().startswith(b"\x89PNG")
+    capsys.readouterr()
+    for command, wrong in (("replay", png), ("compare", tmp_path / "c.pdf")):
+        assert main([command, *results, "--report", str(wrong)]) == 2
+        assert "a page (HTML); give a name that ends in .html" in capsys.readouterr().err
+    assert png.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("hours_apart", [0.25, 9, 240, 24 * 500])
@@ -127,8 +132,8 @@ def test_a_result_with_a_field_missing_or_without_samples_is_one_line(place, tmp
 
 def test_one_alone_twice_the_same_and_a_file_that_is_not_there_are_one_line(place, tmp_path, capsys):
     a = place / "a.yaml"
-    assert "one calibration cannot be compared" in fail(capsys, "compare", a)
-    assert "named twice" in fail(capsys, "compare", a, a)
+    assert "one alone cannot be compared; name two" in fail(capsys, "compare", a)
+    assert "cannot be compared with itself" in fail(capsys, "compare", a, a)
     (tmp_path / "copy.yaml").write_bytes(a.read_bytes())
     for other in (tmp_path / "copy.yaml", place / "a"):  # the bag that it is from
         assert "are the same calibration" in fail(capsys, "compare", place / "b.yaml", a, other)

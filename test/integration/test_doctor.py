@@ -22,10 +22,10 @@ import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter
-from dvl_calib_ros.calibration.filters.observability import MEASURES_VERTICAL
+from dvl_calib_ros.calibration.filters.observability import MEASURES_TURNS, MEASURES_VERTICAL
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.calibration.results.mounting_quantities import quantities
+from dvl_calib_ros.calibration.results.mounting_quantities import not_shown, quantities
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, _units, examine
 from dvl_calib_ros.present.examination import next_commands
@@ -331,10 +331,27 @@ def test_the_standard_deviations_are_those_that_the_replay_claims(name, tmp_path
     bag = ROOT / "bags" / name if run is None else simulated(tmp_path / "bag", **run)
     examined = examine([bag], Parameters(mounting_rpy=(run or {}).get("mounting_rpy", (0.0, 0.0, 0.0))))
     parameters = examined.discovery.parameters
-    claimed = {each.name: each for each in quantities(replay([bag], parameters).result)}
+    replayed = replay([bag], parameters)
+    claimed = {each.name: each for each in quantities(replayed.result)}
+    named = " and ".join(not_shown(replayed.result).values())
     for each in examined.shown:
+        assert each.needs == "" or each.name in named, each
         assert each.std == pytest.approx(claimed[each.name].std), each
         assert claimed[each.name].shown == (each.needs == ""), each
+
+
+@pytest.mark.parametrize(
+    ("command", "answer", "named_at"), [("doctor", "partly: ", "out"), ("replay", "accept: ", "err")]
+)
+def test_the_answer_comes_before_the_finding_that_there_is_no_imu(capsys, command, answer, named_at):
+    out, err = succeed(capsys, command, ROOT / "bags" / "straight_leg")
+    assert out.startswith(answer) and "Nothing else wrong" not in out
+    assert "no IMU in the bag: " in {"out": out, "err": err}[named_at]
+
+
+def test_no_straight_leg_is_asked_for_on_a_straight_leg():
+    needs = {each.name: each.needs for each in examine([ROOT / "bags" / "straight_leg"], Parameters()).shown}
+    assert needs["pitch"] == needs["roll"] == MEASURES_TURNS
 
 
 def test_a_bag_without_a_dvl_is_refused_in_one_line(tmp_path, capsys):

@@ -18,6 +18,7 @@ import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.checked_replay import checked_replay
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.present.replay import next_commands
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.verdict.kinds import Severity
@@ -101,9 +102,13 @@ def test_a_reference_in_a_bag_of_its_own_belongs_to_the_recording_of_its_time(tm
 
 def test_two_recordings_of_the_same_time_are_said_to_be(place, tmp_path):
     other = recorded(tmp_path / "other", 0, 2.0)
-    verification = checked_replay([place / "monday", other], Parameters()).result.verifications["M3"]
+    bags = [place / "monday", other]
+    replayed = checked_replay(bags, Parameters(model="M3"))
+    verification = replayed.result.verifications["M3"]
     assert verification.verdict is Severity.REJECT
     assert verification.reasons[0].code == "BAGS_OVERLAP"
+    assert verification.reasons[0].full_sentence.startswith("The DVL is in monday and in other at the same time")
+    assert next_commands(replayed, bags, None, (), doubts=False)[0].startswith("dvl-calib compare ")
     assert checked_replay([other], Parameters()).result.verifications["M3"].verdict is Severity.ACCEPT  # by itself
 
 

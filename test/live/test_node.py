@@ -425,6 +425,16 @@ def test_after_a_stall_no_topic_runs_ahead_of_another(world, bag):
         np.testing.assert_allclose(live.estimates[name].state, offline.estimates[name].state, rtol=0, atol=1e-12)
 
 
+def test_the_first_warning_of_each_code_is_in_the_log(world, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(CalibrationNode, "warn", lambda _, text: said.append(text))
+    with node_here(world, discover=False):
+        heard = world.received(DiagnosticArray, "/diagnostics")
+        until(lambda: sum("DVL_NO_MESSAGE" in each.status[0].message for each in heard) > 2, "a silent DVL, thrice")
+    assert [text for text in said if text.endswith("[DVL_NO_MESSAGE]")] == [said[0]]
+    assert said[0].startswith("no DVL message yet; check the sensor")
+
+
 def test_best_effort_and_reliable_publishers_are_both_heard(world):
     with node_here(world) as node:
         first = Publisher(world)

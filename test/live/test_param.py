@@ -32,6 +32,7 @@ def test_parameters_of_a_running_node_are_listed_read_and_set(world, capsys, mon
     [
         (["set", "model", "M99"], "M99"),
         (["set", "modell", "M4"], "model"),
+        (["set", "lever_arm", "[1, 0, 0]"], "start the node with -p lever_arm:="),
         (["get", "modell"], "model"),
         (["get"], "give: list, get NAME, or set NAME VALUE"),
         (["set", "model"], "give: list"),

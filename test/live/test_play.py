@@ -164,6 +164,7 @@ def test_who_comes_late_hears_the_recorded_description_with_the_transforms_as_jo
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (["--rate", "0"], "--rate: 0 is outside"),
         (["--rate", "0.001"], "--rate: 0.001 is outside"),
         (["--rate", "nan"], "--rate: nan is outside"),
         (["--clock", "1e6"], "--clock"),

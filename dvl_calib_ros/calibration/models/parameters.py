@@ -463,5 +463,5 @@ def check_names(names: Mapping[str, Any]) -> None:
     for name in names:
         if name not in SCHEMA:
             near = difflib.get_close_matches(str(name), SCHEMA, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else f"; there are {', '.join(SCHEMA)}"
+            hint = f", did you mean {near[0]!r}?" if near else "; dvl-calib parameters lists them"
             raise ParameterError(f"{name}: no such parameter{hint}")

@@ -11,7 +11,7 @@ from ..filters.observability import OBSERVED_SHARE
 from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
-from .results import Result, corrected_rpy, rpy_std, scale_and_delay
+from .results import Estimate, Result, corrected_rpy, rpy_std, scale_and_delay
 
 # Axes of `observability` that need angular velocities.
 _NEED_IMU = ("lever arm x", "lever arm y", "lever arm z", "time offset")
@@ -84,7 +84,17 @@ def not_shown(result: Result) -> dict[str, str]:
         if entry.missing and entry.axis != "scale across":
             axis = f"the vehicle's {entry.axis} axis" if entry.axis in shown else entry.axis
             causes.setdefault(entry.missing, {})[axis] = None
-    return {missing: " and ".join(axes) for missing, axes in causes.items()}
+    for name in ("roll", "pitch", "yaw"):
+        if name not in shown.union(*causes.values()):
+            causes.setdefault(missing_for(name, result.estimate), {})[name] = None
+    return {missing: " and ".join(axes).replace("time offset", LATE) for missing, axes in causes.items()}
+
+
+def missing_for(name: str, estimate: Estimate) -> str:
+    """Return what makes a quantity observable. Roll and pitch need the same if a turned DVL mixes them."""
+    missing = {entry.axis: entry.missing for entry in estimate.observability if entry.missing}
+    other = missing.get({"roll": "pitch", "pitch": "roll"}.get(name, ""))
+    return missing.get(name) or other or MODELS[estimate.model].shown_by[name]
 
 
 def _has_imu(result: Result) -> bool:

@@ -61,7 +61,7 @@ def test_a_draw_is_written_and_exported(tmp_path, capsys):
     assert f"{arms[3]:.4f}"[:5] in (tmp_path / "dvl.sdf").read_text()
     sdf = tmp_path / "other.sdf"
     says = fail(capsys, "export", "gazebo", tmp_path / "samples.json", "--sample", 5, "-o", sdf)
-    assert "has 5 samples, so none of number 5" in says
+    assert "no sample 5; it has 5, numbered from 0" in says
     for damaged, says in (({"a": 1}, "has 0 samples"), ([3, 4], "damaged diagnosis"), ([{"effects": 5}], "damaged")):
         content = json.loads((tmp_path / "samples.json").read_text()) | {"samples": damaged}
         (tmp_path / "damaged.json").write_text(json.dumps(content))

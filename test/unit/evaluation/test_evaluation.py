@@ -292,6 +292,9 @@ def in_cm_per_s(path: Path) -> None:
 
 BAD = {
     "a missing trajectory": (lambda f: (f / "T07_dvl.csv").unlink(), "T07_dvl.csv missing", "--partial"),
+    "no trajectory at all": (
+        lambda f: [each.unlink() for each in f.glob("*_dvl.csv")], "T03_dvl.csv and more missing", "or two bags",
+    ),
     "a missing calibration run": (lambda f: (f / "T14_dvl.csv").unlink(), "T14_dvl.csv missing", "needs T12"),
     "a calibration run shorter than its window": (
         lambda f: keep_rows(f / "T12_dvl.csv", 150), "T12_dvl.csv: ends at row 150 after 150 s", "needs 200 s",
@@ -353,7 +356,7 @@ def test_without_a_folder_the_command_says_that_the_trajectories_are_its_own(cap
         (["--models", "M9"], "--models: 'M9' is none of"),
         (["--sets", "E5"], "--sets: 'E5' is none of"),
         (["--seeds", "0"], "--seeds: 0 is outside"),
-        (["--jobs", "-2"], "--jobs: -2 is negative"),
+        (["--jobs", "-2"], "jobs: -2 is no number of processes"),
         (["--json", "no/such/e.json"], "no/such"),
         (["--json", "same", "--csv", "same"], "--json and --csv: both write same"),
         (["nowhere"], "nowhere: no such file or folder"),

@@ -121,6 +121,7 @@ def test_what_is_wrong_in_a_file_is_said_with_the_name_of_file_and_parameter(tmp
     [
         (b"", "no ROS 2 parameter file"),
         (b"min_speed: 0.5\n", "no ros__parameters in it"),
+        (b"format: dvl_calib_ros result 1\n", "it is a result file, which -p initial_calibration"),
         (b"- a\n- b\n", "no ROS 2 parameter file"),
         (b"/**: [\n  x: {\n", "not valid YAML"),
         (b"/**:\n\tros__parameters: 1\n", "not valid YAML"),

@@ -380,7 +380,7 @@ def test_each_vehicle_has_its_own_reason_the_most_urgent_first(made):
         (("nowhere", "--out", "out"), "nowhere: no such folder"),
         (("file", "--out", "out"), "no recording"),
         (("recorded", "--out", "out", "-p", "initial_calibration:=file"), "initial_calibration"),
-        ((".", "--out", "out", "--jobs", "-1"), "--jobs: -1 is negative"),
+        ((".", "--out", "out", "--jobs", "-1"), "jobs: -1 is no number of processes"),
         (("recorded", "--out", "file/out"), "file/out"),
         ((".", "--out", "out", "--vehicle-from", "("), "--vehicle-from"),
     ],
