@@ -393,11 +393,6 @@ def test_bad_usage_is_refused_in_one_line(arguments, said, tmp_path, monkeypatch
     assert said in fail(capsys, "fleet", *arguments)
 
 
-def test_the_python_interface_refuses_a_negative_number_of_processes_as_the_command_does(tmp_path):
-    with pytest.raises(dc.InputError, match="jobs: -1 is negative"):
-        dc.fleet(tmp_path, tmp_path / "out", jobs=-1)
-
-
 # ------------------------------------------------------------------ workers that die
 
 
