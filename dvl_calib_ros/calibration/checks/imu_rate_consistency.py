@@ -34,7 +34,7 @@ EQUAL_FACTOR, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
 # A rotation with row elements this near 1 only exchanges axes, which is tested separately.
 EXCHANGED_FROM = 0.95
 # Priors: σ of a gyroscope's bias (MEMS, rad/s), and of the change of the attitude's error during a recording (rad).
-GYRO_BIAS_STD, ATTITUDE_CHANGE_STD = math.radians(0.2), math.radians(3.0)
+GYRO_BIAS_STD, ATTITUDE_CHANGE_STD = math.radians(0.2), math.radians(1.0)
 # A larger difference (σ) is no bias but another convention.
 LARGEST_BIAS = 5.0
 # Sine of the tilt below which an attitude is a heading only.

@@ -44,6 +44,8 @@ MAX_STEPS, LAST_STEP = 8, 0.3
 # Blocks whose streams are kept (40 minutes), because a node's memory must not grow. Older ones contribute a fixed sum,
 # and registration uses at most the rows of a third of them.
 KEPT_BLOCKS = 240
+# Memory (s) of a slow error that is constant.
+CONSTANT_S = 1e6
 # Points of the slow errors' prior for the numerical integration.
 N_POINTS = 16
 # The points are re-centred when the data move them by RECENTRED_FROM σ of the prior, at most MAX_RECENTRED times.
@@ -110,7 +112,7 @@ class _Day:
 
 
 class _PriorPoints(NamedTuple):
-    """Points of the slow errors' prior: slow errors (C, 6), and scales of the heading deviation (C,).
+    """Points of the slow errors' prior: slow errors (C, 7), and scales of the heading deviation (C,).
 
     log_weight: (C,) log importance weights.
     """
@@ -192,8 +194,9 @@ class JointFit:
         at = _UNIT_POINTS + self._centre
         horizontal, vertical, heading, memory, deviation = (median * factor**at).T
         tilt = np.full_like(heading, p.tilt)
-        std = np.stack([horizontal, horizontal, vertical, tilt, tilt, heading], axis=1)
-        slow = SlowErrors(std, np.repeat(memory[:, None], std.shape[1], axis=1))
+        constant, whole_run = np.full_like(heading, p.heading_offset), np.full_like(memory, CONSTANT_S)
+        std = np.stack([horizontal, horizontal, vertical, tilt, tilt, heading, constant], axis=1)
+        slow = SlowErrors(std, np.stack([*[memory] * 6, whole_run], axis=1))
         return _PriorPoints(slow, deviation, 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1)))
 
     def _recentre(self) -> None:
@@ -279,7 +282,7 @@ class JointFit:
         if self._fitted is None or not self.has_data:
             return None
         weights, slow = self._fitted.weights, self._points.slow
-        horizontal, *_, heading = np.sqrt(weights @ slow.std**2).tolist()
+        horizontal, *_, heading, _ = np.sqrt(weights @ slow.std**2).tolist()
         return SlowNoise(horizontal, heading, float(weights @ slow.memory_s[:, 0]))
 
     def _by_day(self, state: GaussianState) -> list[GaussianState]:

@@ -38,8 +38,11 @@ from ..numerics.robust import MEDIAN_SQUARE
 from ..numerics.samples import Index, Mask
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
-# Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad).
-SLOW = 6
+# Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad); constant error of the
+# heading (rad), such as a declination that is not set. The yaw is relative to that heading. What is left of the error
+# is the velocity of the lever arm, which the gyroscopes measure about the vehicle's own axes, and what tilts.
+SLOW = 7
+_UP = np.array([0.0, 0.0, 1.0])
 # Half-width of the difference for angular acceleration, s.
 TURNING_S = 0.1
 # At sample intervals below this, s, slopes come from parabolas instead of a spline.
@@ -112,7 +115,7 @@ class PredictedRows(NamedTuple):
     times: (J,) s.
     residual: (J, 3) m/s.
     columns: (J, 3, 20) derivatives of the prediction by the states.
-    slow: (J, 3, 6) derivatives of the prediction by the slow errors.
+    slow: (J, 3, 7) derivatives of the prediction by the slow errors.
     weight: (J, 3) 1 where a reference measures the axis, else 0.
     fold: (J,) hold-out fold.
     up: (J, 21) derivatives of the DVL's velocity upwards by the states, and that velocity (m/s); 0 without attitude.
@@ -364,7 +367,9 @@ def _predicted(joined: JoinedBlocks, x: Array, parameters: Parameters) -> list[P
     columns[:, :, REFERENCE_ERROR] = turns[:, :, None] * np.eye(3)
     slow = np.zeros((len(used), 3, SLOW))
     slow[:, :, :3] = np.eye(3)
-    slow[:, :, 3:] = -turns[:, :, None] * skew(velocity)
+    slow[:, :, 3:6] = -turns[:, :, None] * skew(velocity)
+    of_dvl = body + cross(streams.imu.rates, np.array(parameters.lever_arm) + x[LEVER_ARM])
+    slow[:, :, 6] = turns * (np.matmul(onto, cross(_UP, of_dvl)[..., None])[..., 0] - cross(_UP, velocity))
     rows = PredictedRows(
         times=joined.reference.times[used],
         residual=joined.reference.velocity[used] - velocity - turns * x[REFERENCE_ERROR], columns=columns, slow=slow,

@@ -33,7 +33,7 @@ class HeldOutSums:
         before, after: rows of the block about the nominal and the corrected state.
         state: x, P of the states, fitted without the fold.
         white: (3,) (m/s)², variance of the white noise per axis.
-        slow: (6,) variances of the slow errors, as the columns of `PredictedRows.slow`.
+        slow: (7,) variances of the slow errors, as the columns of `PredictedRows.slow`.
         """
         in_fold = np.flatnonzero(after.fold == fold)
         at = in_fold[np.isin(after.times[in_fold], before.times, assume_unique=True)]

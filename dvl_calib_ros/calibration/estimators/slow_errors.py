@@ -33,7 +33,7 @@ LEAST_SHARE = 0.4
 
 
 class SlowErrors(NamedTuple):
-    """Standard deviation and memory (s) of the slow errors (C, 6) at C points of their prior."""
+    """Standard deviation and memory (s) of the slow errors (C, 7) at C points of their prior."""
 
     std: Array
     memory_s: Array
@@ -61,6 +61,7 @@ class Priors:
 
     horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s.
     heading, tilt: AHRS, rad.
+    heading_offset: constant error of a compass whose declination may not be set, rad.
     memory: 10 to 300 s (90 %).
     deviation: heading deviation as a share of `heading_deviation_std`.
     """
@@ -69,6 +70,7 @@ class Priors:
     vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
     heading: LogNormal = field(default_factory=lambda: LogNormal(math.radians(0.21), 1.7))
     tilt: float = math.radians(0.1)
+    heading_offset: float = math.radians(10.0)
     memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
     deviation: LogNormal = field(default_factory=lambda: LogNormal(0.3, 3.0))
 
@@ -169,7 +171,7 @@ class Eliminated(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """Chain of sections up to a knot: Gram matrix (C, 27, 27) over [slow errors there, states, residual]."""
+    """Chain of sections up to a knot: Gram matrix (C, 28, 28) over [slow errors there, states, residual]."""
 
     gram: Array
     log_determinant: Array
