@@ -444,7 +444,13 @@ def _fitted(
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
     prior_error = p[:, : len(NUISANCE_STD)] * (prior * prior_std)[: len(NUISANCE_STD)]
     std = student_factor(effective_blocks(contributions[None])[0] - 1.0) * _std(p @ scores.T, group_sizes)
+    std = np.maximum(std, np.sqrt(np.diag(p) * _mean_square(weight, residual)))
     return _Fit(estimate, np.sqrt(std**2 + (prior_error**2).sum(axis=1)), p, weight, starts)
+
+
+def _mean_square(weight: Array, values: Array) -> float:
+    """Return the weighted mean square of values (N, 3): white noise, below which few stretches may scatter."""
+    return float(weight @ (values**2).sum(axis=1)) / (3.0 * float(weight.sum()))
 
 
 def _std(scatter: Array, group_sizes: Sequence[int]) -> Array:
@@ -501,8 +507,10 @@ def _noise_in_reference(samples: _ResidualSamples, fast: _FastFit) -> _KeptNoise
             if square <= 0.0:
                 continue
             share = float(np.einsum("n,ni,ni->", weight, past, kept)) / square
-            scores = np.add.reduceat(weight * (past * (kept - share * past)).sum(axis=1), fast.fit.starts)
-            std = math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES)
+            left = kept - share * past
+            scores = np.add.reduceat(weight * (past * left).sum(axis=1), fast.fit.starts)
+            scatter = float(_std(scores[None] / square, QUICK_STRETCHES)[0])
+            std = math.hypot(max(scatter, math.sqrt(_mean_square(weight, left) / square)), OF_WAVES)
             if share - Z_95_PERCENT * std < 1.0:  # no filter makes more of the noise than there is: that is motion
                 candidates.append(_KeptNoise(share, std, seconds))
     return max(candidates, key=lambda kept_noise: kept_noise.share / kept_noise.std, default=_NO_KEPT_NOISE)
