@@ -29,7 +29,7 @@ from ..numerics.robust import MEDIAN_DISTANCE, ROUNDING_MPS
 from ..numerics.samples import Index
 from ..results.results import TAPE_STD_M
 from .full_delay_search import DelaySums
-from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
+from .full_forward_model import CONSTANT, FitBlock, bias_by_data, predicted, with_bias_in_mounting
 from .full_held_out import INSTRUMENT_ERRORS, HeldOutSums
 from .section_rows import GATE_SQUARE, SectionRows, beam_fault_grams, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
@@ -44,8 +44,6 @@ MAX_STEPS, LAST_STEP = 8, 0.3
 # Blocks whose streams are kept (40 minutes), because a node's memory must not grow. Older ones contribute a fixed sum,
 # and registration uses at most the rows of a third of them.
 KEPT_BLOCKS = 240
-# Memory (s) of a slow error that is constant.
-CONSTANT_S = 1e6
 # Points of the slow errors' prior for the numerical integration.
 N_POINTS = 16
 # The points are re-centred when the data move them by RECENTRED_FROM σ of the prior, at most MAX_RECENTRED times.
@@ -188,16 +186,8 @@ class JointFit:
 
     def _points_about_centre(self) -> _PriorPoints:
         """Return the points of the prior, shifted by `_centre`."""
-        p = Priors()
-        levels = p.horizontal, p.vertical, p.heading, p.memory, p.deviation
-        median, factor = np.array(levels).T
         at = _UNIT_POINTS + self._centre
-        horizontal, vertical, heading, memory, deviation = (median * factor**at).T
-        tilt = np.full_like(heading, p.tilt)
-        constant, whole_run = np.full_like(heading, p.heading_offset), np.full_like(memory, CONSTANT_S)
-        std = np.stack([horizontal, horizontal, vertical, tilt, tilt, heading, constant], axis=1)
-        slow = SlowErrors(std, np.stack([*[memory] * 6, whole_run], axis=1))
-        return _PriorPoints(slow, deviation, 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1)))
+        return _PriorPoints(*Priors().at(at), 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1)))
 
     def _recentre(self) -> None:
         """Move the prior points to the data's estimate of the slow errors, and add up all sections again."""
@@ -461,7 +451,7 @@ class JointFit:
         if not self.has_data:
             return None
         slow = self._points.slow.part(self._likeliest)
-        slow_variance, memory_s = slow.std[0] ** 2, float(slow.memory_s[0, 0])
+        slow_variance, memory_s = slow.std[0, :CONSTANT] ** 2, float(slow.memory_s[0, 0])
         sums, seconds = HeldOutSums(), 0.0
         for day in self._days:
             for block in day.blocks:
@@ -479,6 +469,11 @@ class JointFit:
                     sums.add(before, after, fold, state, day.single, slow_variance)
                     seconds += (block.end_s - block.from_s) * float(np.mean(block.fold == fold))
         return sums.error(seconds, memory_s)
+
+    @property
+    def dvl_bias(self) -> GaussianState | None:
+        """Return the DVL's bias, see `bias_by_data`; None before the first block."""
+        return None if self._fitted is None or not self.has_data else bias_by_data(self._fitted.state, self._prior)
 
     def beam_fault(self) -> BeamFault | None:
         """Return the most significant fault of one beam, by the residual of the blocks whose streams are kept."""
