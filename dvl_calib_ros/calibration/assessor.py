@@ -148,8 +148,9 @@ class Assessor:
         corrections = [day_terms for fold_terms in terms for day_terms in fold_terms]
         further = self._further
         return dead_reckoned(
-            recording, indices, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
-        )
+            recording, indices, corrections, p, epoch_ns, deviation, further.slow_noise, further.dvl_bias,
+            further.beam_fault,
+        )  # fmt: skip
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """Return, per fold and day, one model's corrections estimated without that fold.
@@ -368,6 +369,11 @@ class NonlinearEstimators:
     def slow_noise(self) -> SlowNoise | None:
         """Slow errors of reference and attitude as estimated; None if not estimated."""
         return self._first(lambda estimator: estimator.slow_noise)
+
+    @property
+    def dvl_bias(self) -> GaussianState | None:
+        """DVL's bias by the data alone, of the first estimator that has one."""
+        return self._first(lambda estimator: estimator.dvl_bias)
 
     @property
     def beam_fault(self) -> BeamFault | None:

@@ -68,7 +68,7 @@ def test_a_vehicle_that_is_z_down_gets_its_mounting_in_its_own_axes(tmp_path, ca
     up, down = (replay(vehicle(z_down, std=0.002).write(tmp_path / str(z_down))) for z_down in (False, True))
     assert up.replayed.result.parameters["base_axes"] == "flu" and down.replayed.result.parameters["base_axes"] == "frd"
     assert is_right(up, truth_deg())
-    np.testing.assert_allclose(found_deg(down), found_deg(up) * [1.0, -1.0, -1.0], atol=0.1)
+    np.testing.assert_allclose(found_deg(down), found_deg(up) * [1.0, -1.0, -1.0], atol=0.15)
     arms = [each.replayed.result.parameters["lever_arm"] for each in (up, down)]
     np.testing.assert_allclose(arms[1], FLU_FROM_FRD @ arms[0])
     assert "base_axes frd" in " ".join(down.discovery.found)

@@ -20,7 +20,7 @@ from validation.figures.unmarked import unmarked
 # What looks measured and is not, by page: parameters, limits, arithmetic, what the paper says, examples of output
 DEFINITIONS = {
     "evaluation.md": ("R 0.2 m/s with GNSS and 0.025 m/s without",),
-    "models.md": ("(1.9988, -0.0698, 0)",),
+    "models.md": ("(1.9988, -0.0698, 0)", "**A constant heading error** ψ (σ 10°)"),
     "recordings.md": ("median speed below 0.3 m/s",),
     "operate.md": ("A scale error of 0.5 % corresponds to 7.5 m/s of speed of sound",),
 }

@@ -111,6 +111,8 @@ class Navigation:
         Heading deviation; None if not significant.
     followed
         Signals that the residual velocity follows; None without attitude, or for too little data.
+    bias
+        Bias x (3,) m/s, P (3, 3) of the DVL, body axes; None if not estimated.
     beam
         Most significant fault of one beam; None if not tested.
     """
@@ -132,6 +134,7 @@ class Navigation:
     error_after: Array
     deviation: HeadingDeviation | None = None
     followed: ResidualTrend | None = None
+    bias: GaussianState | None = None
     beam: BeamFault | None = None
 
     @property
@@ -148,6 +151,7 @@ def dead_reckoned(
     epoch_ns: int = 0,
     heading: GaussianState | None = None,
     slow: SlowNoise | None = None,
+    bias: GaussianState | None = None,
     beam: BeamFault | None = None,
 ) -> Navigation | None:
     """Compare the track of the DVL, uncorrected and corrected, with the reference; None without reference or motion.
@@ -155,7 +159,7 @@ def dead_reckoned(
     folds: (N,) index into `terms` of each DVL sample's correction.
     epoch_ns: stamp of the recording's time 0.
     heading: see `Estimate.heading_deviation`.
-    slow, beam: None if not estimated.
+    slow, bias (DVL axes), beam: None if not estimated.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
@@ -198,8 +202,13 @@ def dead_reckoned(
         error_after=after.in_body[used[shown]],
         deviation=heading_deviation(after.yaw[used], heading) if on_a_map and heading is not None else None,
         followed=_followed(recording, after, used, parameters) if on_a_map else None,
+        bias=None if bias is None else _in_body(bias, parameters.rotation_dvl_from_body),
         beam=beam,
     )
+
+
+def _in_body(bias: GaussianState, rotation_dvl_from_body: Array) -> GaussianState:
+    return GaussianState(bias.x @ rotation_dvl_from_body, rotation_dvl_from_body.T @ bias.p @ rotation_dvl_from_body)
 
 
 class _ErrorTable(NamedTuple):
@@ -386,6 +395,7 @@ def doubts(
         navigation.followed,
         are_positions(parameters),
         confused_with_bias_std(estimate, parameters),
+        navigation.bias,
         None if suggested else navigation.beam,
         ACCEPTED_DRIFT * parameters.target_drift / KM,
         float(estimate.state[:3] @ estimate.state[:3]),

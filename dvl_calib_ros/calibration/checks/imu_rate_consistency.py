@@ -1,9 +1,9 @@
-"""Test of whether an IMU's angular velocity agrees with the rotation of its attitude.
+"""Comparison of an IMU's angular velocity with the rotation of its attitude: conventions, and bias of the gyroscopes.
 
 The calibration uses both: the attitude rotates the reference into the body, the angular velocity moves the DVL about
 the reference point. A driver may mix conventions: negated rates, degrees, earth axes, compass heading as ENU yaw. A
-wrong lever arm then fits the data nearly as well, and no residual shows it. This test compares the differentiated
-attitude with the rates.
+wrong lever arm then fits the data nearly as well, and no residual shows it. A bias of the gyroscopes, times the lever
+arm, looks like a bias of the DVL. The differentiated attitude has neither.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ MAX_LEFT_SHARE, MIN_WRONG_SHARE = 0.25, 0.02
 EQUAL_FACTOR, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
 # A rotation with row elements this near 1 only exchanges axes, which is tested separately.
 EXCHANGED_FROM = 0.95
+# Priors: σ of a gyroscope's bias (MEMS, rad/s), and of the change of the attitude's error during a recording (rad).
+GYRO_BIAS_STD, ATTITUDE_CHANGE_STD = math.radians(0.2), math.radians(1.0)
+# A larger difference (σ) is no bias but another convention.
+LARGEST_BIAS = 5.0
 # Sine of the tilt below which an attitude is a heading only.
 LEVEL_BELOW = 1e-6
 _BODY, _ENU, _NED = range(3)
@@ -69,6 +73,19 @@ class AttitudeRates:
         # Σ a wᵀ and Σ w wᵀ, with the angular velocity w assumed in body, ENU and NED axes
         self._both = np.zeros((3, 3, 3))
         self._rates = np.zeros((3, 3, 3))
+        self.end_day()
+
+    def end_day(self) -> None:
+        """Forget the bias of the gyroscopes, which is another one after they are switched on again."""
+        self._excess, self._seconds = np.zeros(3), 0.0  # rotation of the gyroscopes less that of the attitude, rad
+
+    @property
+    def bias(self) -> Array:
+        """Return the bias (3,) rad/s of the gyroscopes; 0 if the attitude is a heading only or has other axes."""
+        prior = (ATTITUDE_CHANGE_STD / GYRO_BIAS_STD) ** 2
+        found: Array = self._excess * self._seconds / (self._seconds**2 + prior)
+        is_bias = self._tilted and float(np.abs(found).max()) < LARGEST_BIAS * GYRO_BIAS_STD
+        return found if is_bias else np.zeros(3)
 
     def add(self, times: Array, orientation: Array, angular_velocity: Array, begins: Sequence[int] = (0,)) -> None:
         """Add the next samples in order of time.
@@ -89,7 +106,9 @@ class AttitudeRates:
         first, last = np.concatenate(pairs, axis=1)
         is_short = times[last] - times[first] <= LONGEST_S
         spans = _span_rates(times, orientation, angular_velocity, first[is_short], last[is_short])
-        of_attitude, of_rates, body_from_enu = spans
+        of_attitude, of_rates, body_from_enu, span_s = spans
+        self._excess += ((of_rates - of_attitude) * span_s[:, None]).sum(axis=0)
+        self._seconds += float(span_s.sum())
         self._n += len(of_attitude)
         self._tilted = self._tilted or bool((np.abs(body_from_enu[:, :2, 2]) > LEVEL_BELOW).any())
         self._turning += of_attitude.T @ of_attitude
@@ -152,25 +171,26 @@ class AttitudeRates:
 class _SpanRates(NamedTuple):
     """Mean turn rates (S, 3) rad/s over spans, by the attitude (body axes) and by the angular velocity (its axes).
 
-    body_from_enu: (S, 3, 3) attitude in the middle.
+    body_from_enu: (S, 3, 3) attitude in the middle. seconds: (S,) length.
     """
 
     of_attitude: Array
     of_rates: Array
     body_from_enu: Array
+    seconds: Array
 
 
 def _span_rates(times: Array, orientation: Array, angular_velocity: Array, first: Index, last: Index) -> _SpanRates:
     """Return the mean turn rates from samples `first` (S,) to `last` (S,). Streams: see `AttitudeRates.add`."""
-    seconds = (times[last] - times[first])[:, None]
+    seconds = times[last] - times[first]
     before, after = orientation[first], orientation[last]
-    of_attitude = rotation_vector(quaternion_product(before * _INVERSE, after)) / seconds
+    of_attitude = rotation_vector(quaternion_product(before * _INVERSE, after)) / seconds[:, None]
     steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
     angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
-    return _SpanRates(of_attitude, (angles[last] - angles[first]) / seconds, body_from_enu)
+    return _SpanRates(of_attitude, (angles[last] - angles[first]) / seconds[:, None], body_from_enu, seconds)
 
 
 def _spans(times: Array) -> Index:

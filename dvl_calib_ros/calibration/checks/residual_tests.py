@@ -26,6 +26,7 @@ from ..models.own import heading_cycles
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
+from ..numerics.kalman import GaussianState
 from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, ROBUST_PASSES, median, robust_std
 from ..numerics.samples import Index
 from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
@@ -84,7 +85,6 @@ class ResidualTrend(NamedTuple):
 
     tilt, tilt_std: (2,) share of roll and pitch missing in the DVL's velocity: 0 if correct, 1 if levelled, ±2 for a
       wrong sign.
-    bias, bias_std: (3,) m/s, of the DVL, body.
     smoothed, smoothed_std: s², half the squared time constant of the reference; negative for the DVL.
     lean: (2,) rad, mean roll and pitch.
     speed: m/s, rms.
@@ -97,8 +97,6 @@ class ResidualTrend(NamedTuple):
 
     tilt: Array
     tilt_std: Array
-    bias: Array
-    bias_std: Array
     smoothed: float
     smoothed_std: float
     lean: Array
@@ -162,7 +160,7 @@ def residual_trend(
     is_observable = is_tilting and fast.bend_gain > LEAST_OF_BEND
     circular = _noise_in_reference(samples, fast)
     return ResidualTrend(
-        tilt=tilt, tilt_std=tilt_std, bias=means.bias.x[-3:], bias_std=means.bias.std[-3:],
+        tilt=tilt, tilt_std=tilt_std,
         smoothed=float(fast.fit.x[-1] / fast.bend_gain) if is_observable else 0.0,
         smoothed_std=float(fast.fit.std[-1] / fast.bend_gain) if is_observable else math.inf,
         lean=np.array([roll.mean(), pitch.mean()]), speed=math.sqrt(float((velocity**2).sum(axis=1).mean())),
@@ -340,6 +338,7 @@ def residual_warnings(
     trend: ResidualTrend | None,
     of_positions: bool = False,
     mounting_std: Sequence[float] | Array = (0.0, 0.0, 0.0),
+    bias: GaussianState | None = None,
     beam: BeamFault | None = None,
     accepted: float = 0.01,
     second_order: float = 0.0,
@@ -348,6 +347,7 @@ def residual_warnings(
 
     of_positions: the reference's velocities are position differences, smoothed by their interval.
     mounting_std: see `confused_with_bias_std`.
+    bias: x (3,) m/s, P (3, 3) of the DVL, body axes; None if not estimated.
     accepted: error of the mounting (rad, or share of the distance) that does not reject a calibration; nor does an
       error within its own 95 % interval.
     second_order: square of the misalignment, rad²: the error of its first-order model, which looks like a beam.
@@ -374,7 +374,7 @@ def residual_warnings(
         reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(error)).weighed(severity))
     if all(reason.severity is Severity.WARNING for reason in reasons):  # a wrong tilt or heading looks like a beam
         reasons += beam_warning(beam, max(accepted, second_order))
-    return reasons + _bias_warnings(trend, mounting_std, accepted)
+    return reasons if bias is None else reasons + _bias_warnings(bias, trend.speed, mounting_std, accepted)
 
 
 def _tilt_warnings(trend: ResidualTrend, accepted: float) -> list[Reason]:
@@ -392,23 +392,25 @@ def _tilt_warnings(trend: ResidualTrend, accepted: float) -> list[Reason]:
     return reasons
 
 
-def _bias_warnings(trend: ResidualTrend, mounting_std: Sequence[float] | Array, accepted: float) -> list[Reason]:
+def _bias_warnings(
+    bias: GaussianState, speed: float, mounting_std: Sequence[float] | Array, accepted: float
+) -> list[Reason]:
     """Return the reason for a significant bias, or for one speed that does not show it; see `residual_warnings`."""
-    magnitude = np.abs(trend.bias)
-    is_significant = (magnitude > Z_FIFTY_TESTS * trend.bias_std) & (magnitude > REPORTED_FROM_RAD * trend.speed)
+    magnitude, std = np.abs(bias.x), np.sqrt(np.diag(bias.p))
+    is_significant = (magnitude > Z_FIFTY_TESTS * std) & (magnitude > REPORTED_FROM_RAD * speed)
     if is_significant.any():
         axes = ", ".join(
-            f"{axis} {1000.0 * trend.bias[i]:+.0f} ± {1000.0 * trend.bias_std[i]:.0f}"
+            f"{axis} {1000.0 * bias.x[i]:+.0f} ± {1000.0 * std[i]:.0f}"
             for i, axis in enumerate("xyz")
             if is_significant[i]
         )
-        angle = float(magnitude[is_significant].max()) / trend.speed
-        allowed_mps = np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * trend.speed
-        is_wrong = is_significant & (magnitude - trend.bias_std > allowed_mps)
+        angle = float(magnitude[is_significant].max()) / speed
+        allowed_mps = np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * speed
+        is_wrong = is_significant & (magnitude - std > allowed_mps)
         severity = Severity.REJECT if is_wrong.any() else Severity.MARGINAL
         return [finding("DVL_BIAS", axes=axes, degrees=math.degrees(angle)).weighed(severity)]
-    if float(trend.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
-        share = TYPICAL_BIAS_MPS / trend.speed
+    if float(std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
+        share = TYPICAL_BIAS_MPS / speed
         return [finding("ONE_SPEED", off=TYPICAL_BIAS_MPS, degrees=math.degrees(share), percent=100.0 * share)]
     return []
 
@@ -444,7 +446,13 @@ def _fitted(
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
     prior_error = p[:, : len(NUISANCE_STD)] * (prior * prior_std)[: len(NUISANCE_STD)]
     std = student_factor(effective_blocks(contributions[None])[0] - 1.0) * _std(p @ scores.T, group_sizes)
+    std = np.maximum(std, np.sqrt(np.diag(p) * _mean_square(weight, residual)))
     return _Fit(estimate, np.sqrt(std**2 + (prior_error**2).sum(axis=1)), p, weight, starts)
+
+
+def _mean_square(weight: Array, values: Array) -> float:
+    """Return the weighted mean square of values (N, 3): white noise, below which few stretches may scatter."""
+    return float(weight @ (values**2).sum(axis=1)) / (3.0 * float(weight.sum()))
 
 
 def _std(scatter: Array, group_sizes: Sequence[int]) -> Array:
@@ -501,8 +509,10 @@ def _noise_in_reference(samples: _ResidualSamples, fast: _FastFit) -> _KeptNoise
             if square <= 0.0:
                 continue
             share = float(np.einsum("n,ni,ni->", weight, past, kept)) / square
-            scores = np.add.reduceat(weight * (past * (kept - share * past)).sum(axis=1), fast.fit.starts)
-            std = math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES)
+            left = kept - share * past
+            scores = np.add.reduceat(weight * (past * left).sum(axis=1), fast.fit.starts)
+            scatter = float(_std(scores[None] / square, QUICK_STRETCHES)[0])
+            std = math.hypot(max(scatter, math.sqrt(_mean_square(weight, left) / square)), OF_WAVES)
             if share - Z_95_PERCENT * std < 1.0:  # no filter makes more of the noise than there is: that is motion
                 candidates.append(_KeptNoise(share, std, seconds))
     return max(candidates, key=lambda kept_noise: kept_noise.share / kept_noise.std, default=_NO_KEPT_NOISE)

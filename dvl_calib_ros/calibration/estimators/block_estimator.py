@@ -512,6 +512,11 @@ class FullEstimator(Estimator):
         return self._idle_solver().fit.slow_noise
 
     @property
+    def dvl_bias(self) -> GaussianState | None:
+        """See `Estimator`."""
+        return self._idle_solver().fit.dvl_bias
+
+    @property
     def beam_fault(self) -> BeamFault | None:
         """See `Estimator`."""
         return self._idle_solver().fit.beam_fault()

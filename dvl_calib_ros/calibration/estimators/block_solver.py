@@ -152,12 +152,16 @@ class BlockSolver:
         for _ in range(block.new_days):
             self.fit.end_day()
             self._clocks.end_day()
+            self._attitude_rates.end_day()
         p = self._parameters
         streams = cleaned(block, p, self.epoch_ns)
         self._spikes += streams.reference_spikes
         if not streams.are_compared:
             return self.outcome()
         self._spikes += streams.dvl_spikes
+        self._attitude_rates.add(*ImuColumns(*(column[streams.own_imu] for column in streams.imu)))
+        unbiased = streams.imu.angular_velocity - self._attitude_rates.bias
+        streams = streams._replace(imu=streams.imu._replace(angular_velocity=unbiased))
         self._check_instruments(streams)
         self.has_imu = self.has_imu or len(streams.imu.times) > 0
         if not self.has_imu and streams.reference.in_body.all():
@@ -177,7 +181,6 @@ class BlockSolver:
         """Add a block's samples to the checks of instruments and clocks, and to the streams for verification."""
         block, reference, dvl, p = streams.block, streams.reference, streams.dvl, self._parameters
         rotation, oriented = attitude_at(streams.imu, reference.times, p.imu_timeout)
-        self._attitude_rates.add(*ImuColumns(*(column[streams.own_imu] for column in streams.imu)))
         self._compare_noise(streams, in_body(reference, rotation, oriented))
         self._in_earth = self._in_earth or not reference.in_body.all()
         stamps_ns = block.dvl.stamps_ns

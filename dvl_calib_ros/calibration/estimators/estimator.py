@@ -135,6 +135,11 @@ class Estimator(ABC):
         return None
 
     @property
+    def dvl_bias(self) -> GaussianState | None:
+        """DVL's bias x (3,) m/s, P (3, 3), DVL axes, by the data alone; None if not estimated."""
+        return None
+
+    @property
     def beam_fault(self) -> BeamFault | None:
         """Most significant fault of one beam of the DVL; None if not tested."""
         return None

@@ -29,7 +29,7 @@ from ..numerics.robust import MEDIAN_DISTANCE, ROUNDING_MPS
 from ..numerics.samples import Index
 from ..results.results import TAPE_STD_M
 from .full_delay_search import DelaySums
-from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
+from .full_forward_model import CONSTANT, FitBlock, bias_by_data, predicted, with_bias_in_mounting
 from .full_held_out import INSTRUMENT_ERRORS, HeldOutSums
 from .section_rows import GATE_SQUARE, SectionRows, beam_fault_grams, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
@@ -110,7 +110,7 @@ class _Day:
 
 
 class _PriorPoints(NamedTuple):
-    """Points of the slow errors' prior: slow errors (C, 6), and scales of the heading deviation (C,).
+    """Points of the slow errors' prior: slow errors (C, 7), and scales of the heading deviation (C,).
 
     log_weight: (C,) log importance weights.
     """
@@ -186,15 +186,8 @@ class JointFit:
 
     def _points_about_centre(self) -> _PriorPoints:
         """Return the points of the prior, shifted by `_centre`."""
-        p = Priors()
-        levels = p.horizontal, p.vertical, p.heading, p.memory, p.deviation
-        median, factor = np.array(levels).T
         at = _UNIT_POINTS + self._centre
-        horizontal, vertical, heading, memory, deviation = (median * factor**at).T
-        tilt = np.full_like(heading, p.tilt)
-        std = np.stack([horizontal, horizontal, vertical, tilt, tilt, heading], axis=1)
-        slow = SlowErrors(std, np.repeat(memory[:, None], std.shape[1], axis=1))
-        return _PriorPoints(slow, deviation, 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1)))
+        return _PriorPoints(*Priors().at(at), 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1)))
 
     def _recentre(self) -> None:
         """Move the prior points to the data's estimate of the slow errors, and add up all sections again."""
@@ -279,7 +272,7 @@ class JointFit:
         if self._fitted is None or not self.has_data:
             return None
         weights, slow = self._fitted.weights, self._points.slow
-        horizontal, *_, heading = np.sqrt(weights @ slow.std**2).tolist()
+        horizontal, *_, heading, _ = np.sqrt(weights @ slow.std**2).tolist()
         return SlowNoise(horizontal, heading, float(weights @ slow.memory_s[:, 0]))
 
     def _by_day(self, state: GaussianState) -> list[GaussianState]:
@@ -458,7 +451,7 @@ class JointFit:
         if not self.has_data:
             return None
         slow = self._points.slow.part(self._likeliest)
-        slow_variance, memory_s = slow.std[0] ** 2, float(slow.memory_s[0, 0])
+        slow_variance, memory_s = slow.std[0, :CONSTANT] ** 2, float(slow.memory_s[0, 0])
         sums, seconds = HeldOutSums(), 0.0
         for day in self._days:
             for block in day.blocks:
@@ -476,6 +469,11 @@ class JointFit:
                     sums.add(before, after, fold, state, day.single, slow_variance)
                     seconds += (block.end_s - block.from_s) * float(np.mean(block.fold == fold))
         return sums.error(seconds, memory_s)
+
+    @property
+    def dvl_bias(self) -> GaussianState | None:
+        """Return the DVL's bias, see `bias_by_data`; None before the first block."""
+        return None if self._fitted is None or not self.has_data else bias_by_data(self._fitted.state, self._prior)
 
     def beam_fault(self) -> BeamFault | None:
         """Return the most significant fault of one beam, by the residual of the blocks whose streams are kept."""

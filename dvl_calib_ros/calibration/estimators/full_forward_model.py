@@ -38,14 +38,19 @@ from ..numerics.robust import MEDIAN_SQUARE
 from ..numerics.samples import Index, Mask
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
-# Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad).
-SLOW = 6
+# Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad); constant error of the
+# heading (rad), such as a declination that is not set. The yaw is relative to that heading. What is left of the error
+# is the velocity of the lever arm, which the gyroscopes measure about the vehicle's own axes, and what tilts.
+SLOW, CONSTANT = 7, 6
+_UP = np.array([0.0, 0.0, 1.0])
 # Half-width of the difference for angular acceleration, s.
 TURNING_S = 0.1
 # At sample intervals below this, s, slopes come from parabolas instead of a spline.
 DENSE_S = 0.15
 # Half-width of the difference for the DVL's acceleration, and bins of dense references: s, and intervals of the DVL.
 SPAN_S, SPAN_INTERVALS = 0.5, 2.0
+# Prior σ of a bias, m/s, below which it is known, and smallest information that the data add to it, as a share of it.
+EXACT_MPS, LEAST_LEARNED = 1e-6, 1e-4
 # Blocks that are predicted at once: more do not fit the processor's caches.
 AT_ONCE = 16
 # Longest gap of the DVL that is interpolated: the larger of this number of its usual intervals and this time, s.
@@ -112,7 +117,7 @@ class PredictedRows(NamedTuple):
     times: (J,) s.
     residual: (J, 3) m/s.
     columns: (J, 3, 20) derivatives of the prediction by the states.
-    slow: (J, 3, 6) derivatives of the prediction by the slow errors.
+    slow: (J, 3, 7) derivatives of the prediction by the slow errors.
     weight: (J, 3) 1 where a reference measures the axis, else 0.
     fold: (J,) hold-out fold.
     up: (J, 21) derivatives of the DVL's velocity upwards by the states, and that velocity (m/s); 0 without attitude.
@@ -364,7 +369,10 @@ def _predicted(joined: JoinedBlocks, x: Array, parameters: Parameters) -> list[P
     columns[:, :, REFERENCE_ERROR] = turns[:, :, None] * np.eye(3)
     slow = np.zeros((len(used), 3, SLOW))
     slow[:, :, :3] = np.eye(3)
-    slow[:, :, 3:] = -turns[:, :, None] * skew(velocity)
+    slow[:, :, 3:6] = -turns[:, :, None] * skew(velocity)
+    of_dvl = body + cross(streams.imu.rates, np.array(parameters.lever_arm) + x[LEVER_ARM])
+    body_up = np.sign(rotation[:, 2, 2:]) * _UP  # a body may be z-down
+    slow[:, :, CONSTANT] = turns * (np.matmul(onto, cross(body_up, of_dvl)[..., None])[..., 0] - cross(_UP, velocity))
     rows = PredictedRows(
         times=joined.reference.times[used],
         residual=joined.reference.velocity[used] - velocity - turns * x[REFERENCE_ERROR], columns=columns, slow=slow,
@@ -387,6 +395,19 @@ def _about_up(angle: Array) -> Array:
 def deviation_of(state: GaussianState) -> GaussianState:
     """Return the heading deviation of a state x (20,), P (20, 20), see `Estimate.heading_deviation`."""
     return GaussianState(-state.x[HEADING], state.p[HEADING, HEADING])
+
+
+def bias_by_data(state: GaussianState, prior: GaussianState) -> GaussianState | None:
+    """Return the DVL's bias x (3,) m/s, P (3, 3), DVL axes, by the data without its prior; None if it is known exactly.
+
+    state, prior: x, P, whose first 20 states are those of the first day, before `with_bias_in_mounting`.
+    """
+    if (np.diag(prior.p)[BIAS] < EXACT_MPS**2).any():
+        return None
+    (after, vector), (before, known) = (GaussianState(x[BIAS], p[BIAS, BIAS]).information for x, p in (state, prior))
+    values, axes = np.linalg.eigh(after - before)
+    covariance = axes / np.maximum(values, LEAST_LEARNED * np.linalg.eigvalsh(before)[0]) @ axes.T
+    return GaussianState(covariance @ (vector - known), covariance)
 
 
 def with_bias_in_mounting(x: Array, p: Array) -> GaussianState:

@@ -33,7 +33,7 @@ class HeldOutSums:
         before, after: rows of the block about the nominal and the corrected state.
         state: x, P of the states, fitted without the fold.
         white: (3,) (m/s)², variance of the white noise per axis.
-        slow: (6,) variances of the slow errors, as the columns of `PredictedRows.slow`.
+        slow: (6,) variances of the slow errors that change, as the first columns of `PredictedRows.slow`.
         """
         in_fold = np.flatnonzero(after.fold == fold)
         at = in_fold[np.isin(after.times[in_fold], before.times, assume_unique=True)]
@@ -43,7 +43,7 @@ class HeldOutSums:
         self._before += float((weight * before.residual[same] ** 2).sum())
         self._after += float((weight * after.residual[at] ** 2).sum())
         self._white += float((weight * white).sum())
-        self._slow += float((weight * (after.slow[at] ** 2 * slow).sum(axis=2)).sum())
+        self._slow += float((weight * (after.slow[at, :, : len(slow)] ** 2 * slow).sum(axis=2)).sum())
         self._uncertainty += float((weight * ((columns @ state.p) * columns).sum(axis=2)).sum())
         self._instrument += float((weight * (columns[:, :, INSTRUMENT_ERRORS] @ state.x[INSTRUMENT_ERRORS]) ** 2).sum())
 

@@ -218,7 +218,7 @@ class RegistrationSchedule:
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         state = fit.states[-1]
         terms = [Terms.of_state(states_of_days[-1].x) for states_of_days in fit.without_folds()]
-        instrument_errors = deviation_of(state), fit.slow_noise, fit.beam_fault()
+        instrument_errors = deviation_of(state), fit.slow_noise, fit.dvl_bias, fit.beam_fault()
         return Residuals(
             held_out=fit.held_out_error(),
             typical=typical_error(recording, Terms.of_state(state.x), p),

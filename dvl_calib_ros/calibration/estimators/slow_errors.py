@@ -25,6 +25,8 @@ from .full_forward_model import SLOW, PredictedRows
 # Width of a section's Gram matrix: slow errors at both ends, states, residual.
 WIDTH = 2 * SLOW + N_STATE + 1
 _DELAY, _REFERENCE_DELAY = 2 * SLOW + DELAY, 2 * SLOW + REFERENCE_DELAY
+# Memory (s) of a slow error that is constant.
+CONSTANT_S = 1e6
 # Safety factor on the false information about a delay that DVL noise gives, because it scatters.
 NOISE_TWICE = 2.0
 # Smallest share of signal in the acceleration column; with less it is not used. Gauss-Newton steps are too long by 1 /
@@ -33,7 +35,7 @@ LEAST_SHARE = 0.4
 
 
 class SlowErrors(NamedTuple):
-    """Standard deviation and memory (s) of the slow errors (C, 6) at C points of their prior."""
+    """Standard deviation and memory (s) of the slow errors (C, 7) at C points of their prior."""
 
     std: Array
     memory_s: Array
@@ -61,6 +63,7 @@ class Priors:
 
     horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s.
     heading, tilt: AHRS, rad.
+    heading_offset: constant error of a compass whose declination may not be set, rad.
     memory: 10 to 300 s (90 %).
     deviation: heading deviation as a share of `heading_deviation_std`.
     """
@@ -69,8 +72,17 @@ class Priors:
     vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
     heading: LogNormal = field(default_factory=lambda: LogNormal(math.radians(0.21), 1.7))
     tilt: float = math.radians(0.1)
+    heading_offset: float = math.radians(10.0)
     memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
     deviation: LogNormal = field(default_factory=lambda: LogNormal(0.3, 3.0))
+
+    def at(self, points: Array) -> tuple[SlowErrors, Array]:
+        """Return the slow errors and scales (C,) of the heading deviation at points (C, 5), in σ of the logarithms."""
+        median, factor = np.array([self.horizontal, self.vertical, self.heading, self.memory, self.deviation]).T
+        horizontal, vertical, heading, memory, deviation = (median * factor**points).T
+        tilt, constant = (np.full_like(heading, std) for std in (self.tilt, self.heading_offset))
+        std = np.stack([horizontal, horizontal, vertical, tilt, tilt, heading, constant], axis=1)
+        return SlowErrors(std, np.stack([*[memory] * 6, np.full_like(memory, CONSTANT_S)], axis=1)), deviation
 
 
 def normal_points(k: int, n: int) -> Array:
@@ -169,7 +181,7 @@ class Eliminated(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """Chain of sections up to a knot: Gram matrix (C, 27, 27) over [slow errors there, states, residual]."""
+    """Chain of sections up to a knot: Gram matrix (C, 28, 28) over [slow errors there, states, residual]."""
 
     gram: Array
     log_determinant: Array

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...calibration.checks.imu_rate_consistency import AttitudeRates
 from ...calibration.models.parameters import Parameters
 from ...calibration.numerics.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
 from ...calibration.numerics.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
@@ -21,7 +22,7 @@ from ...calibration.registration.registration import Registration
 from ...calibration.registration.unregistrable_clocks import MOVING_MPS
 from ...calibration.streams.clock_correction import SECOND_NS, Clocks
 from ...calibration.streams.position_velocities import NOISY_MPS
-from ...calibration.streams.screening import NOT_MEASURED_VARIANCE, SMALLEST_VARIANCE
+from ...calibration.streams.screening import NOT_MEASURED_VARIANCE, SMALLEST_VARIANCE, unit_quaternions
 from ...calibration.streams.stream_order import strays
 from ...effects.base import EffectNeeds, depth_of
 from ...errors import InputError
@@ -434,7 +435,7 @@ def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, not
         reference_stream,
         frame=frame,
         attitude=_stream(oriented.stamps_ns - imu_ns, oriented.orientation, first_ns) if len(oriented) > 1 else None,
-        rates=_stream(rated.stamps_ns - imu_ns, rated.angular_velocity, first_ns) if len(rated) > 1 else None,
+        rates=_stream(rated.stamps_ns - imu_ns, _without_bias(rated), first_ns) if len(rated) > 1 else None,
         dvl_std=dvl_std,
         reference_std=std,
         axes=parameters.gnss_axes,
@@ -444,6 +445,13 @@ def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, not
         when = " and ".join(f"{event.after:.0f} s" for event in recording.backward_steps)
         notes.append(f"dvl: its clock was set back at {when}; {twice} samples of what it stamped twice are left out")
     return recording
+
+
+def _without_bias(imu: SampleBlock) -> Array:
+    """Return the angular velocity (N, 3) rad/s of IMU samples without the bias of the gyroscopes."""
+    compared = AttitudeRates()
+    compared.add(1e-9 * (imu.stamps_ns - imu.stamps_ns[0]), unit_quaternions(imu.orientation), imu.angular_velocity)
+    return imu.angular_velocity - compared.bias
 
 
 def _stream(stamps_ns: NDArray[np.int64], values: Array, first_ns: int) -> tuple[Array, Array]:

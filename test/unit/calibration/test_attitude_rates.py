@@ -155,6 +155,34 @@ def test_an_attitude_without_roll_and_pitch_is_a_heading_alone():
         assert checked.is_level is is_level
 
 
+BIAS = np.array([0.004, -0.003, 0.006])
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 100.0])
+def test_the_bias_of_the_gyroscopes_is_what_the_attitude_does_not_turn_by(rate_hz):
+    checked = AttitudeRates()
+    times, orientation, rates = vehicle(rate_hz=rate_hz)
+    for part in np.array_split(np.arange(len(times)), 12):
+        checked.add(times[part], orientation[part], rates[part] + BIAS)
+    np.testing.assert_allclose(checked.bias, BIAS, atol=3e-4)
+    checked.end_day()
+    assert not checked.bias.any()
+
+
+def test_what_is_no_bias_of_the_gyroscopes_is_not_removed():
+    times, orientation, rates = vehicle()
+    level = orientation * [0.0, 0.0, 1.0, 1.0]
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    for wrong in (
+        (times, level, rates + BIAS),
+        (times, orientation, rates + 0.1),
+        (times[:1], orientation[:1], BIAS[None]),
+    ):
+        checked = AttitudeRates()
+        checked.add(*wrong)
+        assert not checked.bias.any()
+
+
 # ---------------------------------------------------------------------- a compass that deviates
 
 

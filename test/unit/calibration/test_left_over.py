@@ -18,6 +18,7 @@ from dvl_calib_ros.calibration.checks.residual_tests import (
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.verdict.kinds import Severity
 
 STEP_S = 0.2
@@ -45,8 +46,11 @@ class Vehicle:
         self.rates[:, 2] = self.yaw_rate
         self.noise = rng.normal(0.0, 0.03, self.body.shape), rng.normal(0.0, 0.01, self.body.shape)
 
-    def found(self, dvl=None, reference=None, turns=None, interval_s=0.0):
-        """By a DVL (N, 3) in the body, a reference (N, 3) in the earth and an IMU; what is not given is right."""
+    def found(self, dvl=None, reference=None, turns=None, interval_s=0.0, kept=slice(None)):
+        """By a DVL (N, 3) in the body, a reference (N, 3) in the earth and an IMU; what is not given is right.
+
+        kept: samples that came.
+        """
         turns = self.turns if turns is None else turns
         seen = (self.earth if reference is None else reference) + self.noise[0]
         body = np.einsum("nji,nj->ni", turns, seen)
@@ -56,7 +60,7 @@ class Vehicle:
         lean = np.cross(moving, np.eye(3)[:, None]).transpose(1, 2, 0)
         x = np.linalg.lstsq(lean.reshape(-1, 3), error.reshape(-1), rcond=None)[0]
         left = error - lean @ x
-        return residual_trend(self.time, turns, body, left, self.rates, interval_s)
+        return residual_trend(self.time[kept], turns[kept], body[kept], left[kept], self.rates[kept], interval_s)
 
 
 def smoothed(values, seconds):
@@ -71,8 +75,7 @@ def smoothed(values, seconds):
 @pytest.mark.parametrize("speeds", [(0.8, 1.2, 1.6), (1.2, 1.2, 1.2)])
 def test_where_all_is_right_only_what_does_not_show_is_said(rng, wave_deg, speeds):
     found = residual_warnings(Vehicle(rng, wave_deg=wave_deg, speeds=speeds).found())
-    tilt, bias = ["TILT_NOT_SHOWN"] * (wave_deg < 1.0), ["ONE_SPEED"] * (len(set(speeds)) == 1)
-    assert [each.code for each in found] == tilt + bias
+    assert [each.code for each in found] == ["TILT_NOT_SHOWN"] * (wave_deg < 1.0)
     assert all(each.severity is Severity.WARNING for each in found)
 
 
@@ -117,14 +120,6 @@ def test_a_heading_that_drifts_leaves_the_yaw_open(rng, drift_deg, word):
     assert said.code == "HEADING_DRIFTS" and said.severity is word
     covered = residual_warnings(found, mounting_std=(0.0, math.radians(2.0), 0.0))
     assert [each.severity for each in covered] == [Severity.WARNING]
-
-
-def test_a_bias_shows_at_several_speeds(rng):
-    vehicle = Vehicle(rng)
-    found = vehicle.found(dvl=vehicle.body + np.array([0.02, -0.025, 0.0]))
-    assert found.bias[:2] == pytest.approx([0.02, -0.025], abs=0.01)
-    (said,) = residual_warnings(found)
-    assert said.severity is Severity.REJECT and said.code == "DVL_BIAS"
 
 
 def estimate_with(east: float, north: float) -> SimpleNamespace:
@@ -173,31 +168,29 @@ def test_what_turns_with_the_vehicle_is_no_bed(rng):
         assert moving_bed(found, estimate_with(0.0, 0.0)) is None
 
 
-def test_noise_of_the_dvl_is_no_bias_where_the_speed_hardly_changes():
-    """It was a scale, of the noise in the mean itself, and a bias against that: 3 to 5 σ on legs at one speed."""
-    found = []
-    for seed in range(8):
-        vehicle = Vehicle(np.random.default_rng(seed), seconds=300.0, speeds=(1.2, 1.2, 1.2))
-        vehicle.noise = vehicle.noise[0], 6.0 * vehicle.noise[1]
-        left = vehicle.found()
-        found.append(left.bias / left.bias_std)
-    assert np.sqrt(np.mean(np.square(found), axis=0))[0] < 1.8 and abs(np.mean(found, axis=0)[0]) < 1.0
-
-
 def test_a_bias_is_named_from_the_level_of_a_recordings_tests(rng):
     """27 ± 7 mm/s, which were 1.4 degrees of yaw at 0.2, were accepted."""
     found = Vehicle(rng).found()
     for bias, words in ((0.02, []), (0.024, []), (0.026, [Severity.REJECT])):
-        biased = found._replace(bias=np.array([0.0, bias, 0.0]), bias_std=np.full(3, 0.0067))
-        assert [each.severity for each in residual_warnings(biased) if each.code == "DVL_BIAS"] == words
+        said = residual_warnings(found, bias=estimated((0.0, bias, 0.0), 0.0067))
+        assert [each.severity for each in said if each.code == "DVL_BIAS"] == words
+
+
+def estimated(bias, std: float) -> GaussianState:
+    return GaussianState(np.array(bias), std**2 * np.eye(3))
+
+
+def test_at_one_speed_a_bias_is_not_shown(rng):
+    found = Vehicle(rng).found()
+    for std, codes in ((0.007, []), (0.009, ["ONE_SPEED"])):
+        assert [each.code for each in residual_warnings(found, bias=estimated(np.zeros(3), std))] == codes
 
 
 @pytest.mark.slow
-def test_few_turns_show_a_bias_or_a_filter_no_more_surely_than_few_can():
-    """Of six legs a bias of nothing was found at 3.8 σ, and smoothing at 2.9, from which on a filter is believed."""
+def test_few_turns_show_a_filter_no_more_surely_than_few_can():
+    """Of six legs smoothing by nothing was found at 2.9 σ, from which on a filter is believed."""
     found = [Vehicle(np.random.default_rng(seed), seconds=250.0, wave_deg=0.1).found() for seed in range(60)]
     assert max(abs(each.smoothed) / each.smoothed_std for each in found) < 2.4
-    assert np.max([np.abs(each.bias) / each.bias_std for each in found]) < 3.7
     assert np.std([each.smoothed / each.smoothed_std for each in found]) > 0.5
 
 
@@ -206,11 +199,11 @@ def test_a_bias_that_sigma_of_its_own_axis_holds_is_said_and_no_reject(rng, axis
     """28 ± 2 mm/s ahead, beside a scale of 1.7 ± 1.5 %, were a reject."""
     bias = np.zeros(3)
     bias[axis] = 0.028
-    found = Vehicle(rng).found()._replace(bias=bias, bias_std=np.full(3, 0.002), speed=1.6)
+    found, biased = Vehicle(rng).found()._replace(speed=1.6), estimated(bias, 0.002)
     along = [0.002, 0.0146, 0.002]
-    (said,) = [each for each in residual_warnings(found, mounting_std=along) if each.code == "DVL_BIAS"]
+    (said,) = [each for each in residual_warnings(found, mounting_std=along, bias=biased) if each.code == "DVL_BIAS"]
     assert said.severity is word
-    (said,) = [each for each in residual_warnings(found) if each.code == "DVL_BIAS"]
+    (said,) = [each for each in residual_warnings(found, bias=biased) if each.code == "DVL_BIAS"]
     assert said.severity is Severity.REJECT
 
 
@@ -294,6 +287,15 @@ def test_noise_of_their_own_is_not_followed(seed):
     vehicle.noise = 0.3 * vehicle.noise[0] + lasting, vehicle.noise[1]
     found = vehicle.found()
     assert found.circular < 4.5 * found.circular_std
+
+
+@pytest.mark.parametrize("seed", range(3, 6))
+def test_few_samples_without_a_gap_nearby_show_no_filter(seed):
+    """With a fifth of the samples lost hardly one has all its neighbours: a few were 4 to 11 sigma."""
+    rng = np.random.default_rng(seed)
+    vehicle = Vehicle(rng)
+    found = vehicle.found(kept=np.flatnonzero(rng.random(len(vehicle.time)) > 0.2))
+    assert abs(found.circular) <= 3.5 * found.circular_std
 
 
 @pytest.mark.parametrize("seed", range(2))
