@@ -18,10 +18,12 @@ from ...verdict.reasons import Reason, finding
 from ..models.own import BIAS
 from ..numerics.block_covariance import TimeBlocks, inflations
 from ..numerics.frames import Array
-from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS
+from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, chance_of, chi2_isf
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
+# Significance of the best of these beams, σ (Bonferroni).
+Z_BEST_BEAM = math.sqrt(chi2_isf(chance_of(Z_FIFTY_TESTS) / len(AZIMUTHS_DEG), 1.0))
 # Prior σ of the nuisances: the scale of z, and the DVL's bias (m/s), which at one speed looks like a beam.
 Z_SCALE_STD, BIAS_STD = 1.0, 0.1
 
@@ -110,7 +112,7 @@ def beam_warning(fault: BeamFault | None, accepted: float) -> list[Reason]:
 
     accepted: error of the velocity ahead, as a share of the speed, up to which a beam is not reported.
     """
-    if fault is None or fault.share < Z_FIFTY_TESTS * fault.std or fault.least < accepted:
+    if fault is None or fault.share < Z_BEST_BEAM * fault.std or fault.least < accepted:
         return []
     percent, std = 100.0 * fault.share, 100.0 * fault.std
     return [finding("BEAM_OFF", percent=percent, std=std, azimuth=fault.azimuth_deg).weighed(Severity.REJECT)]

@@ -16,12 +16,14 @@ from ..models.own import BIAS
 from ..numerics.block_covariance import BLOCK_S
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from .full_forward_model import SPAN_S, FitBlock, PredictedRows
+from .full_forward_model import CONSTANT, SLOW, SPAN_S, FitBlock, PredictedRows
 from .slow_errors import WIDTH, Bins, Chain, SlowErrors, binned_rows, gram_of
 
 DENSER_RATIO = 0.7  # references are denser than the DVL below this ratio of intervals
 # Squared residual of three axes, in variances, that 1 % of good rows exceed. Beyond it a row has weight gate / misfit.
 GATE_SQUARE = 11.3
+# σ of a slow error that is left out, rad.
+NOTHING_RAD = 1e-6
 # Mean of the smaller 90 % of squares of a standard normal variable.
 TRIMMED_SQUARE = 0.623
 
@@ -84,7 +86,8 @@ def beam_fault_grams(sections: Sequence[SectionRows], x: Array, single: Array, w
     bins = [section.with_beam_faults().bins(single) for section in sections]
     x, k = np.append(x, np.zeros(N_EFFECTS)), N_EFFECTS
     grams = [gram_of(own, white, x, each.slope_variance) for own, each in zip(bins, sections, strict=True)]
-    slow = SlowErrors(*(np.repeat(values, len(sections), axis=0) for values in slow))
+    std = np.where(np.arange(SLOW) == CONSTANT, NOTHING_RAD, slow.std)  # sections cannot differ by a constant
+    slow = SlowErrors(*(np.repeat(values, len(sections), axis=0) for values in (std, slow.memory_s)))
     return Chain.begun(slow, k).after(np.reshape(grams, (-1, WIDTH + k, WIDTH + k)), BLOCK_S, slow).ended().gram
 
 

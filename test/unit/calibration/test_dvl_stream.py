@@ -69,7 +69,7 @@ def test_few_samples_say_nothing(rng):
 
 
 @pytest.mark.parametrize(
-    ("share", "off", "severities"), [(0.036, 0.025, []), (0.04, 0.025, [Severity.REJECT]), (0.047, 0.013, [])]
+    ("share", "off", "severities"), [(0.041, 0.025, []), (0.043, 0.025, [Severity.REJECT]), (0.047, 0.013, [])]
 )
 def test_a_significant_beam_whose_error_matters_rejects_the_calibration(share, off, severities):
     """Eight of twelve recordings with a beam that reads 6 % too much were accepted."""
