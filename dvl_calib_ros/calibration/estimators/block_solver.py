@@ -6,6 +6,7 @@ when a result takes effect.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -97,9 +98,10 @@ class BlockSolver:
 
     def outcome(self, has_rows: bool = False) -> Outcome:
         """Return the results of all blocks so far. has_rows: whether any reference has been used."""
-        fit, gated = self.fit, self.fit.gated + self._spikes
-        counts = ModelCounts(fit.used, gated, fit.mean_misfit, mean_rows=3.0, restarted=self.restarted)
-        return Outcome(tuple(fit.states), counts, self._claims, has_rows)
+        used, gated, misfit = self.fit.counts
+        mean_misfit = misfit / used if used else math.nan
+        counts = ModelCounts(used, gated + self._spikes, mean_misfit, mean_rows=3.0, restarted=self.restarted)
+        return Outcome(tuple(self.fit.states), counts, self._claims, has_rows)
 
     def suggestion(self, *, fresh: bool = True) -> Reason | None:
         """Return the configuration that fits the data, if the given one is grossly wrong.

@@ -9,6 +9,7 @@ Shapes: C points of the prior of the slow errors, A combinations of priors, n st
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -31,7 +32,16 @@ from ..results.results import TAPE_STD_M
 from .full_delay_search import DelaySums
 from .full_forward_model import CONSTANT, FitBlock, bias_by_data, predicted, with_bias_in_mounting
 from .full_held_out import INSTRUMENT_ERRORS, HeldOutSums
-from .section_rows import GATE_SQUARE, SectionRows, beam_fault_grams, masked_median, section_starts, usual_square
+from .section_rows import (
+    GATE_SQUARE,
+    CondensedSection,
+    ReferenceCounts,
+    SectionRows,
+    beam_fault_grams,
+    masked_median,
+    section_starts,
+    usual_square,
+)
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
 OF_DAY = FULL.of_day
@@ -66,21 +76,6 @@ GROSS, GROSS_MPS = 10.0, 0.5
 _UNIT_POINTS: Array = normal_points(5, N_POINTS)
 
 
-class _Section(NamedTuple):
-    """Interval between two knots.
-
-    seconds: length.
-    gram: (WIDTH, WIDTH) Gram matrix of its rows, see slow_errors.py; None without rows.
-    fold: hold-out fold.
-    up: (21,) mean of `PredictedRows.up`, its velocity at zero states; None without attitude or vertical reference.
-    """
-
-    seconds: float
-    gram: Array | None
-    fold: int
-    up: Array | None = None
-
-
 @dataclass
 class _Day:
     """Blocks of one day (recordings with one DVL delay), and their normal equations about the point of linearisation.
@@ -88,7 +83,7 @@ class _Day:
     count: number of blocks so far.
     delays: search of the DVL's delay.
     sections: of the blocks whose streams are kept.
-    before: chains of older blocks, with all sections and without each fold.
+    before: chains of older blocks, with all sections and without each fold. older: their counts.
     chain: of all blocks.
     white: (3,) variance of a bin of weight one.
     single: (3,) variance of a row about its section's median.
@@ -98,8 +93,9 @@ class _Day:
     blocks: list[FitBlock] = field(default_factory=list)
     count: int = 0
     delays: DelaySums = field(default_factory=DelaySums)
-    sections: list[_Section] = field(default_factory=list)
+    sections: list[CondensedSection] = field(default_factory=list)
     before: list[Chain] | None = None
+    older: ReferenceCounts = field(default_factory=ReferenceCounts)
     chain: Chain | None = None
     begin_s: float = math.nan
     end_s: float = math.nan
@@ -164,7 +160,7 @@ class JointEstimate(NamedTuple):
 
 
 class JointFit:
-    """Joint fit of blocks in order of time, one day after the other. used: number of references used."""
+    """Joint fit of blocks in order of time, one day after the other."""
 
     def __init__(self, parameters: Parameters, prior: GaussianState, unknown: GaussianState) -> None:
         """Start from priors.
@@ -179,8 +175,6 @@ class JointFit:
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
         self._points = self._points_about_centre()
         self._known: dict[tuple[int | None, int | None, bool, int], _Hypotheses] = {}
-        self.used = self.gated = 0
-        self._misfit = 0.0
         self._fitted: JointEstimate | None = None
         self._without: tuple[JointEstimate | None, list[list[GaussianState]]] | None = None
 
@@ -211,7 +205,7 @@ class JointFit:
     def add(self, block: FitBlock) -> None:
         """Take the next block. Raise numpy.linalg.LinAlgError and keep the earlier fit if numbers diverge."""
         day = self._days[-1]
-        state = self._x.copy(), self._fitted, self.used, self.gated, self._misfit
+        state = self._x.copy(), self._fitted
         kept = [(day, replace(day, blocks=[*day.blocks], sections=[*day.sections])) for day in self._days]
         try:
             self._add(day, block)
@@ -219,7 +213,7 @@ class JointFit:
             if not all(np.isfinite(value).all() for value in self._fitted.state):
                 raise np.linalg.LinAlgError("the fit diverged")
         except np.linalg.LinAlgError:
-            self._x, self._fitted, self.used, self.gated, self._misfit = state
+            self._x, self._fitted = state
             self._days = [before for _, before in kept]
             raise
 
@@ -250,14 +244,15 @@ class JointFit:
             self._fitted = self._fitted._replace(state=GaussianState(self._x.copy(), more))
 
     @property
-    def mean_misfit(self) -> float:
-        """Mean squared residual of the references used, in variances of three axes; nan without any."""
-        return self._misfit / self.used if self.used else math.nan
+    def counts(self) -> ReferenceCounts:
+        """Numbers of references used and gated, and the squared residuals of those used, in variances of three axes."""
+        parts = (counts for day in self._days for counts in (day.older, *(section.counts for section in day.sections)))
+        return functools.reduce(ReferenceCounts.plus, parts)
 
     @property
     def has_data(self) -> bool:
         """Return whether any reference was used."""
-        return self._fitted is not None and self.used > 0
+        return self._fitted is not None and self.counts.used > 0
 
     @property
     def states(self) -> list[GaussianState]:
@@ -326,6 +321,7 @@ class JointFit:
                 while day.sections and day.begin_s < block.end_s - 1e-6:
                     section = day.sections.pop(0)
                     day.begin_s += section.seconds
+                    day.older = day.older.plus(section.counts)
                     for index, chain in enumerate(before):  # with all folds, then without each
                         gram = None if index - 1 == section.fold else section.gram
                         before[index] = chain.after(gram, section.seconds, slow)
@@ -334,8 +330,6 @@ class JointFit:
     def _linearise(self) -> None:
         """Linearise all blocks about the newest estimate."""
         self._linear = self._x.copy()
-        self.used = self.gated = 0
-        self._misfit = 0.0
         for number, day in enumerate(self._days):
             x = self._linear[self._of_day(number)]
             parts = self._parts(day.blocks, x)
@@ -380,22 +374,21 @@ class JointFit:
                 day.chain = Chain.begun(self._points.slow)
                 day.begin_s = day.end_s = part.from_s
             if part.from_s > day.end_s + 1e-6:
-                self._append(day, _Section(part.from_s - day.end_s, None, -1))
-            gram, fold = None, -1
+                self._append(day, CondensedSection(part.from_s - day.end_s, None, -1))
+            gram, fold, counts = None, -1, ReferenceCounts()
             is_gross = part.rows is not None and bool((np.abs(part.level - day.level) > GROSS * day.level_std).any())
             if is_gross and part.rows is not None:
-                self.gated += len(part.rows.times)
+                counts = ReferenceCounts(gated=len(part.rows.times))
             elif part.rows is not None and np.isfinite(day.white).all():
                 misfit = part.misfit(day.single)
                 good = misfit <= OUTLIER_SQUARE
-                self.used += int(np.count_nonzero(good))
-                self.gated += int(np.count_nonzero(~good))
-                self._misfit += float(misfit[good].sum())
+                used = int(np.count_nonzero(good))
+                counts = ReferenceCounts(used, len(good) - used, float(misfit[good].sum()))
                 bins = part.bins(day.single)
                 gram, fold = gram_of(bins, day.white, x, part.slope_variance), int(bins.fold[len(bins.fold) // 2])
-            self._append(day, _Section(BLOCK_S, gram, fold, None if gram is None else part.up(x)))
+            self._append(day, CondensedSection(BLOCK_S, gram, fold, None if gram is None else part.up(x), counts))
 
-    def _append(self, day: _Day, section: _Section) -> None:
+    def _append(self, day: _Day, section: CondensedSection) -> None:
         """Append a section to the chain of its day."""
         assert day.chain is not None
         day.sections.append(section)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import copy
 import math
+import operator
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +28,34 @@ GATE_SQUARE = 11.3
 NOTHING_RAD = 1e-6
 # Mean of the smaller 90 % of squares of a standard normal variable.
 TRIMMED_SQUARE = 0.623
+
+
+class ReferenceCounts(NamedTuple):
+    """References used and gated, and the sum of squared residuals of those used."""
+
+    used: int = 0
+    gated: int = 0
+    misfit: float = 0.0
+
+    def plus(self, other: ReferenceCounts) -> ReferenceCounts:
+        """Return the sum."""
+        return ReferenceCounts(*map(operator.add, self, other))
+
+
+class CondensedSection(NamedTuple):
+    """Interval between two knots.
+
+    seconds: length.
+    gram: (WIDTH, WIDTH) Gram matrix of its rows, see slow_errors.py; None without rows.
+    fold: hold-out fold.
+    up: (21,) mean of `PredictedRows.up`, its velocity at zero states; None without attitude or vertical reference.
+    """
+
+    seconds: float
+    gram: Array | None
+    fold: int
+    up: Array | None = None
+    counts: ReferenceCounts = ReferenceCounts()
 
 
 class SectionRows:

@@ -155,6 +155,14 @@ def test_a_bias_of_the_dvl_shows_at_several_speeds(bias, is_named):
     assert ("DVL_BIAS" in [each.code for each in residual_warnings(judged.followed, bias=judged.bias)]) == is_named
 
 
+def test_references_of_older_blocks_count_though_their_streams_are_dropped(monkeypatch):
+    """Of a run of three hours the page said that two thirds were not given."""
+    samples = late(0.0, duration=300.0)
+    every = calibrate(samples, NOISE).estimate("full").used
+    monkeypatch.setattr("dvl_calib_ros.calibration.estimators.full_fit.KEPT_BLOCKS", 4)
+    assert calibrate(samples, NOISE).estimate("full").used == pytest.approx(every, rel=0.02)
+
+
 def test_a_dvl_with_one_sample_a_second_in_waves_is_not_found_early():
     """Steps that turned back and forth ended 0.6 s ± 0.1 s early, with half of the noise made by the delay."""
     rng, samples = np.random.default_rng(1), []
