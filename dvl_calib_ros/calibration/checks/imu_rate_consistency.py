@@ -35,8 +35,6 @@ EQUAL_FACTOR, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
 EXCHANGED_FROM = 0.95
 # Priors: σ of a gyroscope's bias (MEMS, rad/s), and of the change of the attitude's error during a recording (rad).
 GYRO_BIAS_STD, ATTITUDE_CHANGE_STD = math.radians(0.2), math.radians(1.0)
-# A larger difference (σ) is no bias but another convention.
-LARGEST_BIAS = 5.0
 # Sine of the tilt below which an attitude is a heading only.
 LEVEL_BELOW = 1e-6
 _BODY, _ENU, _NED = range(3)
@@ -81,11 +79,11 @@ class AttitudeRates:
 
     @property
     def bias(self) -> Array:
-        """Return the bias (3,) rad/s of the gyroscopes; 0 if the attitude is a heading only or has other axes."""
+        """Return the bias (3,) rad/s of the gyroscopes; 0 if the attitude is a heading or has another convention."""
+        if not self._tilted or self.contradiction():
+            return np.zeros(3)
         prior = (ATTITUDE_CHANGE_STD / GYRO_BIAS_STD) ** 2
-        found: Array = self._excess * self._seconds / (self._seconds**2 + prior)
-        is_bias = self._tilted and float(np.abs(found).max()) < LARGEST_BIAS * GYRO_BIAS_STD
-        return found if is_bias else np.zeros(3)
+        return np.asarray(self._excess * self._seconds / (self._seconds**2 + prior))
 
     def add(self, times: Array, orientation: Array, angular_velocity: Array, begins: Sequence[int] = (0,)) -> None:
         """Add the next samples in order of time.
