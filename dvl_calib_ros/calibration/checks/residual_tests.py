@@ -29,7 +29,7 @@ from ..numerics.frames import Array, cross, skew
 from ..numerics.kalman import GaussianState
 from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, ROBUST_PASSES, median, robust_std
 from ..numerics.samples import Index
-from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
+from ..numerics.tests import Z_95_PERCENT, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
 from ..results.results import OFFSETS, Estimate
 from ..streams.interpolation import linear_at
 from .beam_faults import BIAS_STD, BeamFault, beam_warning
@@ -397,7 +397,7 @@ def _bias_warnings(
 ) -> list[Reason]:
     """Return the reason for a significant bias, or for one speed that does not show it; see `residual_warnings`."""
     magnitude, std = np.abs(bias.x), np.sqrt(np.diag(bias.p))
-    is_significant = (magnitude > Z_FIFTY_TESTS * std) & (magnitude > REPORTED_FROM_RAD * speed)
+    is_significant = (magnitude > Z_SLOW_ERRORS * std) & (magnitude > REPORTED_FROM_RAD * speed)
     if is_significant.any():
         axes = ", ".join(
             f"{axis} {1000.0 * bias.x[i]:+.0f} ± {1000.0 * std[i]:.0f}"

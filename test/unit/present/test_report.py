@@ -258,7 +258,7 @@ def test_a_bag_without_gnss_has_no_residuals(tmp_path, monkeypatch):
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_report_of_hardly_any_samples(tmp_path, count):
     page = Page(replay_page(tmp_path, steady_run(count))[0])
-    assert f"{count} of the DVL" in page.text and len(page.images()) > 3
+    assert f"{count} of the DVL" in page.text and len(page.images()) > 1
 
 
 def test_the_hours_between_two_bags_are_cut_out():
