@@ -62,7 +62,11 @@ def test_a_draw_is_written_and_exported(tmp_path, capsys):
     sdf = tmp_path / "other.sdf"
     says = fail(capsys, "export", "gazebo", tmp_path / "samples.json", "--sample", 5, "-o", sdf)
     assert "no sample 5; it has 5, numbered from 0" in says
-    for damaged, says in (({"a": 1}, "no sample 0; it has 0"), ([3, 4], "damaged diagnosis"), ([{"effects": 5}], "damaged")):
+    for damaged, says in (
+        ({"a": 1}, "no sample 0; it has 0"),
+        ([3, 4], "damaged diagnosis"),
+        ([{"effects": 5}], "damaged"),
+    ):
         content = json.loads((tmp_path / "samples.json").read_text()) | {"samples": damaged}
         (tmp_path / "damaged.json").write_text(json.dumps(content))
         assert says in fail(capsys, "export", "gazebo", tmp_path / "damaged.json", "--sample", 0, "-o", sdf)
