@@ -335,10 +335,13 @@ def _quaternions(q: Any) -> Array:
 def _imu(message: Any) -> tuple[Array, Array]:
     """Return quaternion and angular velocity (N, 7), and acceleration (N, 3); nan if missing."""
     values = np.hstack([_quaternions(message.orientation), _columns_of(message.angular_velocity)])
-    values[message.orientation_covariance[..., 0] == NO_DATA, :4] = np.nan
-    values[message.angular_velocity_covariance[..., 0] == NO_DATA, 4:] = np.nan
     acceleration = _columns_of(message.linear_acceleration)
-    acceleration[message.linear_acceleration_covariance[..., 0] == NO_DATA] = np.nan
+    for part, covariance in (
+        (values[:, :4], message.orientation_covariance),
+        (values[:, 4:], message.angular_velocity_covariance),
+        (acceleration, message.linear_acceleration_covariance),
+    ):
+        part[np.atleast_1d(covariance[..., 0] == NO_DATA)] = np.nan
     return values, acceleration
 
 
