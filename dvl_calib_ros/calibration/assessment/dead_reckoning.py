@@ -208,6 +208,7 @@ def dead_reckoned(
 
 
 def _in_body(bias: GaussianState, rotation_dvl_from_body: Array) -> GaussianState:
+    """Rotate a velocity x (3,) m/s, P (3, 3) from the DVL's axes to the body's."""
     return GaussianState(bias.x @ rotation_dvl_from_body, rotation_dvl_from_body.T @ bias.p @ rotation_dvl_from_body)
 
 

@@ -49,7 +49,7 @@ QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
 NUISANCE_STD: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2 + [0.1])
-# Prior σ of the tested signals: shares of tilt, second derivative (s²). The DVL bias is tested on means over MEAN_S.
+# Prior σ of the tested signals: shares of tilt, second derivative (s²). Heading drift and bed: on means over MEAN_S.
 SIGNAL_STD, MEAN_S = np.array([10.0, 10.0, 10.0]), 5.0
 # Smallest tilt (rad, rms) for a test, and share of tilt that the residual must follow.
 LEAST_TILT, MISSING_TILT_SHARE = math.radians(0.08), 0.6
@@ -130,7 +130,7 @@ class _Fit(NamedTuple):
 def residual_trend(
     time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
 ) -> ResidualTrend | None:
-    """Fit tilt and smoothing to all samples, bias and moving bed to means; None for too little data.
+    """Fit tilt and smoothing to all samples, heading drift and moving bed to means; None for too little data.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def residual_trend(
         lean=np.array([roll.mean(), pitch.mean()]), speed=math.sqrt(float((velocity**2).sum(axis=1).mean())),
         circular=circular.share, circular_std=circular.std, circular_s=circular.memory_s,
         over_ground=_over_ground(samples, means.bed), over_ground_std=means.bed.std[OVER_GROUND],
-        turned=float(means.bias.x[-4]), turned_std=float(means.bias.std[-4]),
+        turned=float(means.drift.x[-4]), turned_std=float(means.drift.std[-4]),
     )  # fmt: skip
 
 
@@ -247,14 +247,14 @@ def _fit_fast_signals(
 
 
 class _MeanFits(NamedTuple):
-    """Fits to means over MEAN_S: of a DVL bias, and of the same with a moving bed."""
+    """Fits to means over MEAN_S: of a heading that drifts, and of the same with a moving bed."""
 
-    bias: _Fit
+    drift: _Fit
     bed: _Fit
 
 
 def _fit_means(samples: _ResidualSamples, smoothed: _SmoothedMotion) -> _MeanFits | None:
-    """Fit bias, heading errors and moving bed to means over MEAN_S; None for too little data."""
+    """Fit heading errors, DVL bias and moving bed to means over MEAN_S; None for too little data."""
     time, rotation = samples.time, samples.rotation_enu_from_body
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
@@ -267,10 +267,10 @@ def _fit_means(samples: _ResidualSamples, smoothed: _SmoothedMotion) -> _MeanFit
     columns = np.concatenate([_means(part, starts) for part in (nuisance, by_heading, by_bias)], axis=2)
     data = _means(time, starts), columns, _means(samples.error, starts)
     prior_std = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
-    bias = _fitted(*data, prior_std, LASTING)
+    drift = _fitted(*data, prior_std, LASTING)
     prior_std[OVER_GROUND] = BED_STD_MPS
     bed = _fitted(*data, prior_std, LASTING)
-    return None if bias is None or bed is None else _MeanFits(bias, bed)
+    return None if drift is None or bed is None else _MeanFits(drift, bed)
 
 
 def _over_ground(samples: _ResidualSamples, bed: _Fit) -> Array:

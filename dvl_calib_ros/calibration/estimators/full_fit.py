@@ -9,10 +9,9 @@ Shapes: C points of the prior of the slow errors, A combinations of priors, n st
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -246,13 +245,18 @@ class JointFit:
     @property
     def counts(self) -> ReferenceCounts:
         """Numbers of references used and gated, and the squared residuals of those used, in variances of three axes."""
-        parts = (counts for day in self._days for counts in (day.older, *(section.counts for section in day.sections)))
-        return functools.reduce(ReferenceCounts.plus, parts)
+        return ReferenceCounts.total(self._counts())
+
+    def _counts(self) -> Iterator[ReferenceCounts]:
+        """Yield the counts of dropped blocks and of all sections."""
+        for day in self._days:
+            yield day.older
+            yield from (section.counts for section in day.sections)
 
     @property
     def has_data(self) -> bool:
         """Return whether any reference was used."""
-        return self._fitted is not None and self.counts.used > 0
+        return self._fitted is not None and any(counts.used for counts in self._counts())
 
     @property
     def states(self) -> list[GaussianState]:
@@ -321,7 +325,7 @@ class JointFit:
                 while day.sections and day.begin_s < block.end_s - 1e-6:
                     section = day.sections.pop(0)
                     day.begin_s += section.seconds
-                    day.older = day.older.plus(section.counts)
+                    day.older = ReferenceCounts.total((day.older, section.counts))
                     for index, chain in enumerate(before):  # with all folds, then without each
                         gram = None if index - 1 == section.fold else section.gram
                         before[index] = chain.after(gram, section.seconds, slow)

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import copy
 import math
-import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,9 +36,10 @@ class ReferenceCounts(NamedTuple):
     gated: int = 0
     misfit: float = 0.0
 
-    def plus(self, other: ReferenceCounts) -> ReferenceCounts:
-        """Return the sum."""
-        return ReferenceCounts(*map(operator.add, self, other))
+    @staticmethod
+    def total(parts: Iterable[ReferenceCounts]) -> ReferenceCounts:
+        """Return the sum of parts."""
+        return ReferenceCounts(*map(sum, zip(*parts, strict=True)))
 
 
 class CondensedSection(NamedTuple):

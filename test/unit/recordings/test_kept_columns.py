@@ -225,6 +225,21 @@ def test_whatever_is_recorded_gives_the_same_in_columns(
         assert_same([path], parameters)
 
 
+def test_an_imu_message_without_attitude_that_is_read_by_itself_keeps_its_rates(tmp_path):
+    """As it is where a frame's name is not ASCII: the condition on the attitude chose rows instead of columns."""
+    new = {name.rpartition("/")[2]: made for name, made in JAZZY.types.items()}
+    missing, given = np.append(-1.0, np.zeros(8)), np.zeros(9)
+    stamp, quaternion = new["Time"](1_700_000_000, 0), new["Quaternion"](0.0, 0.0, 0.0, 0.0)
+    rates, none = new["Vector3"](0.1, 0.2, 0.3), new["Vector3"](0.0, 0.0, 0.0)
+    imu = new["Imu"](new["Header"](stamp, "größe"), quaternion, missing, rates, given, none, missing)
+    data = bytes(JAZZY.serialize_cdr(imu, IMU_TYPE))
+    for count in (1, 50):
+        path = tmp_path / f"{count}.mcap"
+        path.write_bytes(mcap_bytes([("imu/data", 10**18 + i, data) for i in range(count)]))
+        samples = [sample for _, sample in assert_same([path], Parameters())]
+        assert len(samples) == count and all("0.1" in str(sample) for sample in samples)
+
+
 def test_messages_of_several_bags_arrive_in_order_of_log_time(tmp_path):
     first = write_bag(tmp_path / "first", run(20.0)[::2])
     second = write_bag(tmp_path / "second", run(20.0)[1::2], "sqlite3")
